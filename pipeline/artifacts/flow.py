@@ -1,0 +1,68 @@
+"""`flow`: optical flow between neighbouring views in both directions, with consistency masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Self
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.base import Artifact
+from pipeline.artifacts.views import read_png, write_png
+
+
+@dataclass(frozen=True)
+class FlowPair:
+    """Flow between two views.
+
+    Attributes:
+        name_i, name_j: the views.
+        forward: [H_i, W_i, 2] float32; pixel x of view i is seen at x + forward[x] in view j.
+        backward: [H_j, W_j, 2] float32, likewise from j to i.
+        mask_forward, mask_backward: bool, where the flow can be trusted.
+    """
+
+    name_i: str
+    name_j: str
+    forward: npt.NDArray[np.float32]
+    backward: npt.NDArray[np.float32]
+    mask_forward: npt.NDArray[np.bool_]
+    mask_backward: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Flow(Artifact):
+    """Flow of all chosen pairs, as Middlebury `.flo` files and mask `.png`s."""
+
+    kind: ClassVar[str] = "flow"
+    pairs: tuple[FlowPair, ...]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def save(self, folder: Path) -> None:
+        for pair in self.pairs:
+            stem = f"{pair.name_i}_{pair.name_j}"
+            for way in ("forward", "backward"):
+                field = np.ascontiguousarray(getattr(pair, way), np.float32)
+                if not cv2.writeOpticalFlow(str(folder / f"{stem}_{way}.flo"), field):
+                    raise OSError(f"cannot write the flow of {stem} into {folder}")
+                mask = np.where(getattr(pair, f"mask_{way}"), np.uint8(255), np.uint8(0))
+                write_png(folder / f"{stem}_{way}_mask.png", mask)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        pairs = []
+        for path in sorted(folder.glob("*_forward.flo")):
+            stem = path.name.removesuffix("_forward.flo")
+            name_i, name_j = stem.split("_", 1)
+            arrays = [cv2.readOpticalFlow(str(folder / f"{stem}_{w}.flo")) for w in WAYS]
+            masks = [read_png(folder / f"{stem}_{w}_mask.png") > 127 for w in WAYS]
+            pairs.append(FlowPair(name_i, name_j, *arrays, *masks))
+        return cls(tuple(pairs))
+
+
+WAYS = ("forward", "backward")

@@ -1,0 +1,96 @@
+"""`gaussians`: the fitted 3D Gaussians, as the standard 3DGS `.ply` (62 properties)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+from plyfile import PlyData, PlyElement
+
+from pipeline.artifacts.base import Artifact
+
+Array = npt.NDArray[np.float32]
+
+#: 3DGS stores spherical harmonics up to degree 3: one constant and 15 further coefficients a colour.
+SH_COEFFICIENTS = 16
+
+
+@dataclass(frozen=True)
+class Gaussians(Artifact):
+    """Gaussians in world coordinates, parametrised as 3DGS stores them.
+
+    Attributes:
+        means: [N, 3] float32.
+        quats_wxyz: [N, 4] float32, unit.
+        log_scales: [N, 3] float32, natural logarithm of the standard deviations.
+        logit_opacities: [N] float32.
+        sh: [N, 16, 3] float32; coefficient 0 is the constant (f_dc), colour = .5 + sum(sh * basis).
+    """
+
+    kind: ClassVar[str] = "gaussians"
+    means: Array
+    quats_wxyz: Array
+    log_scales: Array
+    logit_opacities: Array
+    sh: Array
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def save(self, folder: Path) -> None:
+        write_gaussians_ply(folder / "gaussians.ply", self)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        return cls(**read_gaussians_ply(folder / "gaussians.ply"))
+
+
+def ply_properties() -> list[str]:
+    """The 62 property names of a 3DGS `.ply`, in order."""
+    rest = [f"f_rest_{k}" for k in range(3 * (SH_COEFFICIENTS - 1))]
+    return [
+        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest,
+        "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]  # fmt: skip
+
+
+def write_gaussians_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write the `.ply` that every splat viewer reads (f_rest is channel-major, as in 3DGS)."""
+    count = len(gaussians)
+    rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
+    columns = np.concatenate(
+        [
+            gaussians.means, np.zeros((count, 3), np.float32), gaussians.sh[:, 0], rest,
+            gaussians.logit_opacities[:, None], gaussians.log_scales, gaussians.quats_wxyz,
+        ],
+        axis=1,
+    )  # fmt: skip
+    dtype = np.dtype([(name, "<f4") for name in ply_properties()])
+    rows = np.ascontiguousarray(columns, "<f4").view(dtype).reshape(count)
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+
+
+def read_gaussians_ply(path: Path) -> dict[str, Array]:
+    """Read a 3DGS `.ply` of any spherical-harmonics degree 0..3 into the fields of `Gaussians`."""
+    vertex = PlyData.read(str(path))["vertex"].data
+    count = len(vertex)
+
+    def stack(prefix: str, number: int) -> Array:
+        return np.stack([vertex[f"{prefix}{k}"] for k in range(number)], -1).astype(np.float32)
+
+    sh = np.zeros((count, SH_COEFFICIENTS, 3), np.float32)
+    sh[:, 0] = stack("f_dc_", 3)
+    per_channel = sum(name.startswith("f_rest_") for name in vertex.dtype.names) // 3
+    if per_channel:
+        rest = stack("f_rest_", 3 * per_channel).reshape(count, 3, per_channel)
+        sh[:, 1 : 1 + per_channel] = rest.transpose(0, 2, 1)
+    return {
+        "means": np.stack([vertex[n] for n in "xyz"], -1).astype(np.float32),
+        "quats_wxyz": stack("rot_", 4),
+        "log_scales": stack("scale_", 3),
+        "logit_opacities": np.array(vertex["opacity"], np.float32),
+        "sh": sh,
+    }

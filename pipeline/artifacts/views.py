@@ -1,0 +1,149 @@
+"""`views`: the prepared input photographs, their masks, and how they relate to the originals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.base import Artifact
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph at working size.
+
+    Attributes:
+        name: neutral name, ``"000"``, ``"001"``, ...; the only name that exports may carry.
+        image: [H, W, 3] float32 sRGB in 0..1 (8 bits at rest).
+        mask: [H, W] bool, True where the pixel may be used, or None for all. Outside it there are
+            no points, no matches and no loss.
+        working_from_source: [3, 3] float64 affine map of pixel coordinates (centres at .5) from the
+            stored pixel grid of the source file (before EXIF orientation) to `image`.
+        source_size: (width, height) of that grid.
+        source_name: file name, or ``video.mp4#123``. Stays in the workspace, never exported.
+        source_sha256: of the source file's bytes.
+        focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
+        timestamp: seconds from the start of the video, or None.
+    """
+
+    name: str
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.bool_] | None = None
+    working_from_source: npt.NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    source_size: tuple[int, int] = (0, 0)
+    source_name: str = ""
+    source_sha256: str = ""
+    focal_px: float | None = None
+    timestamp: float | None = None
+
+    @property
+    def width(self) -> int:
+        return int(self.image.shape[1])
+
+    @property
+    def height(self) -> int:
+        return int(self.image.shape[0])
+
+    def gray(self) -> npt.NDArray[np.uint8]:
+        """[H, W] uint8 luma, as feature detectors and optical flow want it."""
+        return np.asarray(cv2.cvtColor(to_uint8(self.image), cv2.COLOR_RGB2GRAY))
+
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """[H, W] bool: the mask, or all True."""
+        return np.ones(self.image.shape[:2], bool) if self.mask is None else self.mask
+
+
+def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
+    """Round an image in 0..1 to 8 bits, clipping what lies outside."""
+    return np.asarray(np.clip(np.rint(np.asarray(image) * 255.0), 0, 255), np.uint8)
+
+
+@dataclass(frozen=True)
+class Views(Artifact):
+    """All photographs of a case, in viewing order where it is known.
+
+    Attributes:
+        views: the photographs; sizes may differ from one to the next.
+        ordered: True if their order is the order in which they were taken (a video).
+    """
+
+    kind: ClassVar[str] = "views"
+    views: tuple[View, ...]
+    ordered: bool = False
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def by_name(self) -> dict[str, View]:
+        return {view.name: view for view in self.views}
+
+    def save(self, folder: Path) -> None:
+        (folder / "images").mkdir()
+        entries = []
+        for view in self.views:
+            write_png(folder / "images" / f"{view.name}.png", to_uint8(view.image))
+            if view.mask is not None:
+                (folder / "masks").mkdir(exist_ok=True)
+                mask = np.where(view.mask, np.uint8(255), np.uint8(0))
+                write_png(folder / "masks" / f"{view.name}.png", mask)
+            entries.append(
+                {
+                    "name": view.name,
+                    "width": view.width,
+                    "height": view.height,
+                    "has_mask": view.mask is not None,
+                    "working_from_source": view.working_from_source.tolist(),
+                    "source_name": view.source_name,
+                    "source_sha256": view.source_sha256,
+                    "source_size": list(view.source_size),
+                    "focal_px": view.focal_px,
+                    "timestamp": view.timestamp,
+                }
+            )
+        text = json.dumps({"ordered": self.ordered, "views": entries}, indent=1)
+        (folder / "views.json").write_text(text + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        meta = json.loads((folder / "views.json").read_text())
+        views = []
+        for entry in meta["views"]:
+            name = entry["name"]
+            image = read_png(folder / "images" / f"{name}.png")
+            mask = read_png(folder / "masks" / f"{name}.png") > 127 if entry["has_mask"] else None
+            views.append(
+                View(
+                    name=name,
+                    image=image.astype(np.float32) / np.float32(255),
+                    mask=mask,
+                    working_from_source=np.asarray(entry["working_from_source"], np.float64),
+                    source_size=tuple(entry["source_size"]),
+                    source_name=entry["source_name"],
+                    source_sha256=entry["source_sha256"],
+                    focal_px=entry["focal_px"],
+                    timestamp=entry["timestamp"],
+                )
+            )
+        return cls(views=tuple(views), ordered=meta["ordered"])
+
+
+def write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
+    """Write a grey [H, W] or RGB [H, W, 3] uint8 image without any metadata."""
+    ok, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {pixels.shape} as PNG")
+    path.write_bytes(data.tobytes())
+
+
+def read_png(path: Path) -> npt.NDArray[np.uint8]:
+    """Read a PNG as written by `write_png`: [H, W] or RGB [H, W, 3] uint8."""
+    data = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if data is None:
+        raise ValueError(f"{path} is not a readable PNG")
+    return np.ascontiguousarray(data if data.ndim == 2 else data[..., ::-1])

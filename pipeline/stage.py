@@ -1,0 +1,207 @@
+"""What a stage is, and the registry that finds the installed ones."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from pipeline.artifacts import Artifact, artifact_class
+from pipeline.errors import RequestError, nearest
+
+ENTRY_POINT_GROUP = "dentalsplat.stages"
+
+
+class StageConfig(BaseModel):
+    """Base of every stage's config: frozen, and unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+def runtime(default: Any, **constraints: Any) -> Any:
+    """A config field that can't change the result (logging, preview intervals): not in the key."""
+    return Field(default, json_schema_extra={"affects_result": False}, **constraints)
+
+
+class StageContext(ABC):
+    """What a running stage may touch: its config, its inputs, its outputs, and the user's screen.
+
+    Attributes:
+        config: the stage's validated config.
+        seed: the one seed that all randomness comes from.
+        threads: how many threads to use; never changes the result.
+        scratch: a folder that survives a kill and is given again to the next run with the same key
+            (checkpoints); deleted when the stage commits.
+    """
+
+    config: Any
+    seed: int
+    threads: int
+    scratch: Path
+
+    @abstractmethod
+    def has(self, kind: str) -> bool:
+        """Is there an input artifact of this kind? Always true for what the stage requires."""
+
+    @abstractmethod
+    def load(self, kind: str) -> Any:
+        """Load the input artifact of a kind."""
+
+    @abstractmethod
+    def output(self, kind: str) -> Path:
+        """The empty folder that will be the artifact `kind`, for stages that write files themselves."""
+
+    def save(self, artifact: Artifact) -> None:
+        """Write an output artifact."""
+        artifact.save(self.output(artifact.kind))
+
+    @abstractmethod
+    def progress(self, step: str, done: int, total: int, **figures: float | int | str) -> None:
+        """Tell how far the stage is: `done` of `total` in `step`, with figures such as the loss."""
+
+    @abstractmethod
+    def warn(self, message: str) -> None:
+        """Tell the user something, now and in the manifest and the summary."""
+
+    @abstractmethod
+    def summarize(self, **figures: float | int | str) -> None:
+        """Record figures for the run's summary and the manifest (counts, errors; no timings)."""
+
+
+class Stage(ABC):
+    """One step of the pipeline: artifacts in, artifacts out.
+
+    A subclass is the thin entry of a stage: it reads config and artifacts and calls plain functions.
+    It must import fast; heavy libraries are imported inside `run`.
+
+    Attributes:
+        name: as on the command line and in the config.
+        version: raised whenever the same config and input give another result.
+        summary: one line for ``pipeline stages``.
+        Config: the stage's config model.
+        requires: artifact kinds it can't do without.
+        optional: kinds it uses where an earlier stage provides them.
+        provides: kinds it writes.
+        libraries: distributions whose versions can change the result, so that they enter the key.
+        methods: value of the config field `method` -> one line about it, where there is a choice.
+        uses_sources: True for a stage that reads the user's files (they are part of its key).
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int]
+    summary: ClassVar[str]
+    Config: ClassVar[type[StageConfig]]
+    requires: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
+    provides: ClassVar[tuple[str, ...]] = ()
+    libraries: ClassVar[tuple[str, ...]] = ()
+    methods: ClassVar[Mapping[str, str]] = {}
+    uses_sources: ClassVar[bool] = False
+
+    def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
+        """Name the files that the stage will read, for stages with `uses_sources`.
+
+        Args:
+            config: the stage's validated config.
+            request: what the user asked for (`images`: list of paths).
+
+        Returns:
+            A stable label for each file (no folders: a moved case is the same case) -> its path.
+        """
+        return {}
+
+    @abstractmethod
+    def run(self, context: StageContext) -> None:
+        """Do the work.
+
+        Raises:
+            RequestError: the input or a config value can't be used (exit status 2).
+            ReconstructionError: the data can't be reconstructed (exit status 3).
+        """
+
+
+@dataclass
+class LocalContext(StageContext):
+    """A context without a store: runs one stage on artifacts in memory (scripts, notebooks, tests)."""
+
+    config: Any
+    folder: Path
+    inputs: Mapping[str, Artifact] = field(default_factory=dict)
+    seed: int = 0
+    threads: int = field(default_factory=lambda: os.cpu_count() or 1)
+    figures: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    on_progress: Callable[..., None] | None = None
+
+    def __post_init__(self) -> None:
+        self.scratch = self.folder / "scratch"
+        self.scratch.mkdir(parents=True, exist_ok=True)
+
+    def has(self, kind: str) -> bool:
+        return kind in self.inputs
+
+    def load(self, kind: str) -> Any:
+        return self.inputs[kind]
+
+    def output(self, kind: str) -> Path:
+        path = self.folder / kind
+        path.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def progress(self, step: str, done: int, total: int, **figures: float | int | str) -> None:
+        if self.on_progress:
+            self.on_progress(step, done, total, **figures)
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+
+    def summarize(self, **figures: float | int | str) -> None:
+        self.figures.update(figures)
+
+    def result(self, kind: str) -> Any:
+        """Load an artifact that the stage wrote."""
+        return artifact_class(kind).load(self.folder / kind)
+
+
+@cache
+def _entry_points() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
+
+
+def stage_names() -> list[str]:
+    """Names of the registered stages (entry points of the group `dentalsplat.stages`)."""
+    return sorted(_entry_points())
+
+
+@cache
+def get_stage(name: str) -> Stage:
+    """Return the registered stage of a name.
+
+    Raises:
+        RequestError: there is none, or its package can't be imported.
+    """
+    found = _entry_points()
+    if not found:
+        raise RequestError(
+            "No stages are registered: dentalsplat is not installed in this Python environment. "
+            "Install it with 'pip install -c constraints.txt -e .' in its folder."
+        )
+    if name not in found:
+        known = ", ".join(sorted(found))
+        raise RequestError(f"Unknown stage '{name}'. The stages are {known}.{nearest(name, found)}")
+    try:
+        stage = found[name].load()()
+    except ImportError as error:
+        raise RequestError(
+            f"The stage '{name}' ({found[name].value}) can't be imported: {error}. Run 'pipeline "
+            "doctor' to see what is missing."
+        ) from error
+    assert isinstance(stage, Stage), f"{found[name].value} is not a pipeline.stage.Stage"
+    return stage
