@@ -27,13 +27,13 @@ class ReconstructionError(PipelineError):
     exit_status = 3
 
 
-class StageFault(PipelineError):
+class StageError(PipelineError):
     """A fault of ours inside a stage; what the earlier stages computed stays in the store."""
 
     exit_status = 1
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or an empty string."""
+    """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing."""
     close = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""

@@ -39,12 +39,14 @@ class StageContext(ABC):
         threads: how many threads to use; never changes the result.
         scratch: a folder that survives a kill and is given again to the next run with the same key
             (checkpoints); deleted when the stage commits.
+        sources: what `Stage.sources` named: label -> file.
     """
 
     config: Any
     seed: int
     threads: int
     scratch: Path
+    sources: Mapping[str, Path]
 
     @abstractmethod
     def has(self, kind: str) -> bool:
@@ -56,7 +58,7 @@ class StageContext(ABC):
 
     @abstractmethod
     def output(self, kind: str) -> Path:
-        """The empty folder that will be the artifact `kind`, for stages that write files themselves."""
+        """The empty folder that will be the artifact `kind`, for stages that write the files."""
 
     def save(self, artifact: Artifact) -> None:
         """Write an output artifact."""
@@ -78,8 +80,8 @@ class StageContext(ABC):
 class Stage(ABC):
     """One step of the pipeline: artifacts in, artifacts out.
 
-    A subclass is the thin entry of a stage: it reads config and artifacts and calls plain functions.
-    It must import fast; heavy libraries are imported inside `run`.
+    A subclass is the thin entry of a stage: it reads config and artifacts and calls plain
+    functions. It must import fast; heavy libraries are imported inside `run`.
 
     Attributes:
         name: as on the command line and in the config.
@@ -129,11 +131,12 @@ class Stage(ABC):
 
 @dataclass
 class LocalContext(StageContext):
-    """A context without a store: runs one stage on artifacts in memory (scripts, notebooks, tests)."""
+    """A context without a store: runs one stage on artifacts in memory (scripts and tests)."""
 
     config: Any
     folder: Path
     inputs: Mapping[str, Artifact] = field(default_factory=dict)
+    sources: Mapping[str, Path] = field(default_factory=dict)
     seed: int = 0
     threads: int = field(default_factory=lambda: os.cpu_count() or 1)
     figures: dict[str, Any] = field(default_factory=dict)

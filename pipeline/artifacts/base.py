@@ -51,7 +51,8 @@ def artifact_class(kind: str) -> type[Artifact]:
         module, name = KINDS[kind].split(":")
     except KeyError:
         raise RequestError(
-            f"Unknown artifact kind '{kind}'; the kinds are {', '.join(KINDS)}.{nearest(kind, KINDS)}"
+            f"Unknown artifact kind '{kind}'; the kinds are {', '.join(KINDS)}."
+            f"{nearest(kind, KINDS)}"
         ) from None
     loaded: type[Artifact] = getattr(importlib.import_module(module), name)
     return loaded

@@ -129,12 +129,11 @@ def reconstruction(cameras: tuple[Camera, ...]):  # type: ignore[no-untyped-def]
     model = pycolmap.Reconstruction()
     for index, camera in enumerate(cameras, start=1):
         parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=index, model="PINHOLE",
-                width=camera.width, height=camera.height, params=parameters,
-            )  # fmt: skip
-        )
+        lens = pycolmap.Camera(
+            camera_id=index, model="PINHOLE",
+            width=camera.width, height=camera.height, params=parameters,
+        )  # fmt: skip
+        model.add_camera_with_trivial_rig(lens)
         pose = pycolmap.Rigid3d(camera.cam_from_world[:3])
         image = pycolmap.Image(name=f"{camera.name}.png", camera_id=index, image_id=index)
         model.add_image_with_trivial_frame(image, pose)
@@ -155,8 +154,8 @@ def read_colmap(folder: Path) -> tuple[Camera, ...]:
         if not image.has_pose:
             continue
         lens = model.cameras[image.camera_id]
-        extra = list(lens.params)[len(lens.focal_length_idxs()) + len(lens.principal_point_idxs()) :]
-        if any(abs(value) > 1e-12 for value in extra):
+        distortion = [lens.params[index] for index in lens.extra_params_idxs()]
+        if any(abs(value) > 1e-12 for value in distortion):
             raise ValueError(
                 f"{folder} uses the camera model {lens.model_name} with distortion; undistort the "
                 "images first (colmap image_undistorter)."
@@ -164,10 +163,13 @@ def read_colmap(folder: Path) -> tuple[Camera, ...]:
         cameras.append(
             Camera(
                 name=Path(image.name).stem,
-                width=lens.width, height=lens.height,
-                fx=lens.focal_length_x, fy=lens.focal_length_y,
-                cx=lens.principal_point_x, cy=lens.principal_point_y,
+                width=lens.width,
+                height=lens.height,
+                fx=lens.focal_length_x,
+                fy=lens.focal_length_y,
+                cx=lens.principal_point_x,
+                cy=lens.principal_point_y,
                 cam_from_world=np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
-            )  # fmt: skip
+            )
         )
     return tuple(cameras)

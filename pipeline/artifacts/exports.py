@@ -1,4 +1,4 @@
-"""`exports`: the files that leave the workspace (viewer page, splats, mesh, video, camera files)."""
+"""`exports`: the files that leave the workspace: viewer page, splats, mesh, video, cameras."""
 
 from __future__ import annotations
 

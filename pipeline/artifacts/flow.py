@@ -59,10 +59,12 @@ class Flow(Artifact):
         for path in sorted(folder.glob("*_forward.flo")):
             stem = path.name.removesuffix("_forward.flo")
             name_i, name_j = stem.split("_", 1)
-            arrays = [cv2.readOpticalFlow(str(folder / f"{stem}_{w}.flo")) for w in WAYS]
-            masks = [read_png(folder / f"{stem}_{w}_mask.png") > 127 for w in WAYS]
-            pairs.append(FlowPair(name_i, name_j, *arrays, *masks))
+            forward, backward = (
+                np.asarray(cv2.readOpticalFlow(str(folder / f"{stem}_{way}.flo")), np.float32)
+                for way in ("forward", "backward")
+            )
+            mask_forward, mask_backward = (
+                read_png(folder / f"{stem}_{way}_mask.png") > 127 for way in ("forward", "backward")
+            )
+            pairs.append(FlowPair(name_i, name_j, forward, backward, mask_forward, mask_backward))
         return cls(tuple(pairs))
-
-
-WAYS = ("forward", "backward")

@@ -14,7 +14,7 @@ from pipeline.artifacts.base import Artifact
 
 Array = npt.NDArray[np.float32]
 
-#: 3DGS stores spherical harmonics up to degree 3: one constant and 15 further coefficients a colour.
+#: 3DGS stores spherical harmonics up to degree 3: a constant and 15 more coefficients a colour.
 SH_COEFFICIENTS = 16
 
 

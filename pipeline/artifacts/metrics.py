@@ -12,7 +12,7 @@ from pipeline.artifacts.base import Artifact
 
 @dataclass(frozen=True)
 class Metrics(Artifact):
-    """Figures by name; nested dicts, lists, numbers and strings only. No timings: bytes must repeat."""
+    """Figures by name: nested dicts, lists, numbers, strings. No timings, so that bytes repeat."""
 
     kind: ClassVar[str] = "metrics"
     figures: dict[str, Any]

@@ -1,4 +1,4 @@
-"""`pointmaps`: for each image pair, the 3D point of every pixel of both, in the frame of the first."""
+"""`pointmaps`: for each image pair, the 3D point of every pixel, in the frame of the first view."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PointmapPair:
 
 
 class Pointmaps(Artifact):
-    """A set of pairs, each read from disk when it is asked for: twelve views are a lot of memory."""
+    """A set of pairs, each read from disk when asked for: twelve views are a lot of memory."""
 
     kind: ClassVar[str] = "pointmaps"
 
@@ -65,7 +65,7 @@ class Pointmaps(Artifact):
 
 
 def write_pair(path: Path, pair: PointmapPair) -> None:
-    """Write one pair as `.npz` (keys points_i, points_j_in_i, confidence_i, confidence_j, names)."""
+    """Write one pair as `.npz`: points_i, points_j_in_i, confidence_i, confidence_j, names."""
     np.savez(
         path,
         points_i=pair.points_i, points_j_in_i=pair.points_j_in_i,

@@ -24,7 +24,8 @@ class Points(Artifact):
         colors: [N, 3] float32 sRGB in 0..1 (8 bits at rest).
         normals: [N, 3] float32 unit vectors towards the cameras that saw the point; 0 if unknown.
         confidence: [N] float32, raw, >= 1, larger is better (as pointmap models give it).
-        scale: [N] float32 local spacing in world units (sigma of 3DGS's initialisation); 0 if unknown.
+        scale: [N] float32 local spacing in world units (sigma of 3DGS's initialisation); 0 if
+            unknown.
     """
 
     kind: ClassVar[str] = "points"
