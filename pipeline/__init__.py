@@ -1,0 +1,33 @@
+"""dentalsplat: a few unposed photographs of teeth in, a 3D scene to look at out.
+
+    import pipeline
+    summary = pipeline.run("photos/", overrides={"fit.iterations": 500})
+
+`run`, `status`, `stages`, `clean` and `doctor` are what the command line calls too. They are
+imported on first use, so that ``import pipeline`` is quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "run": "pipeline.runner",
+    "status": "pipeline.workspace",
+    "stages": "pipeline.workspace",
+    "clean": "pipeline.workspace",
+    "doctor": "pipeline.checkup",
+    "PipelineError": "pipeline.errors",
+    "RequestError": "pipeline.errors",
+    "ReconstructionError": "pipeline.errors",
+    "StageError": "pipeline.errors",
+}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'pipeline' has no attribute '{name}'")

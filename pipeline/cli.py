@@ -1,0 +1,268 @@
+"""The command line: ``pipeline run photos/`` and what goes with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from pipeline.errors import PipelineError, RequestError
+
+EXAMPLES = """\
+dentalsplat turns a few photographs of teeth into a 3D scene that you can turn around and look at.
+
+  pipeline run photos/                      a folder of photographs (3 are enough), the whole job
+  pipeline run film.mp4 --frames 12         a short video, 12 frames of it
+  pipeline run photos/ -w cases/anna        keep everything of this case in a folder of your choice
+  pipeline run photos/ --set views.long_side=768 --set fit.iterations=2000
+  pipeline run photos/ --stages init,sap,fit        only some stages
+  pipeline run -w cases/anna --from fit             again from a stage on
+
+  pipeline status -w cases/anna             what is cached, what is stale and why
+  pipeline stages                           the stages, their methods and settings
+  pipeline doctor                           is everything installed?
+  pipeline clean -w cases/anna              delete results that are not in use
+
+When a run ends, open WORKSPACE/results/viewer.html in a browser. 'pipeline run --help' says more.
+"""
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Photographs of teeth in, a 3D scene out; no GPU, no model weights, no network.",
+)
+
+Images = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="A folder, files, a quoted glob pattern, or one video.", show_default=False
+    ),
+]
+Workspace = Annotated[
+    Path | None,
+    typer.Option("-w", "--workspace", help="Where results are kept.  [default: ./runs/<input>]"),
+]
+Preset = Annotated[
+    str | None, typer.Option("-c", "--config", help="A preset's name, or a YAML file.")
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="stage.key=value, as in fit.iterations=500. May be repeated."),
+]
+Stages = Annotated[
+    str | None, typer.Option("--stages", help="Only these, in this order: init,sap,fit.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the whole trace of an error.")
+    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        print(version_of("dentalsplat"))
+    elif context.invoked_subcommand is None:
+        print(EXAMPLES, end="")
+
+
+@app.command("run")
+def run_command(
+    images: Images = None,
+    workspace: Workspace = None,
+    config: Preset = None,
+    stages: Stages = None,
+    overrides: Overrides = None,
+    frames: Annotated[
+        int | None, typer.Option("--frames", help="Use this many, uniformly sampled.")
+    ] = None,
+    from_stage: Annotated[
+        str | None, typer.Option("--from", help="Begin at this stage; take the rest as it is.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Compute anew what is cached.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would run.")] = False,
+    as_json: AsJson = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the whole trace of an error.")
+    ] = False,
+) -> None:
+    """Reconstruct a scene from photographs; every stage's result is cached."""
+    from pipeline.progress import make_reporter
+    from pipeline.runner import run
+    from pipeline.summary import print_dry_run, print_summary
+
+    changes = list(overrides or [])
+    if frames is not None:
+        changes.append(f"views.frames={frames}")
+    summary = run(
+        images or [],
+        workspace=workspace,
+        preset=config,
+        overrides=changes,
+        stages=_names(stages),
+        from_stage=from_stage,
+        force=force,
+        dry_run=dry_run,
+        reporter=make_reporter(quiet=dry_run),
+    )
+    if as_json:
+        print(json.dumps(summary.to_dict(), indent=1))
+    elif dry_run:
+        print_dry_run(summary)
+    else:
+        print_summary(summary)
+
+
+@app.command("status")
+def status_command(
+    images: Images = None,
+    workspace: Workspace = None,
+    config: Preset = None,
+    stages: Stages = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show each stage: cached, stale (and which field or input changed), missing or failed."""
+    from pipeline.summary import print_status
+    from pipeline.workspace import status
+
+    found = status(
+        images or [],
+        workspace=workspace if workspace or images else _only_workspace(),
+        preset=config,
+        overrides=overrides or [],
+        stages=_names(stages),
+    )
+    if as_json:
+        print(json.dumps([dataclasses.asdict(entry) for entry in found], indent=1))
+    else:
+        print_status(found)
+
+
+@app.command("stages")
+def stages_command(as_json: AsJson = False) -> None:
+    """List the registered stages and methods, with what they require and provide."""
+    from pipeline.summary import print_stages
+    from pipeline.workspace import stages
+
+    found = stages()
+    if as_json:
+        print(json.dumps(found, indent=1))
+    else:
+        print_stages(found)
+
+
+@app.command("doctor")
+def doctor_command(as_json: AsJson = False) -> None:
+    """Check the installation and say how to mend what is wrong."""
+    from pipeline.checkup import doctor
+    from pipeline.summary import print_findings
+
+    found = doctor()
+    if as_json:
+        print(json.dumps([dataclasses.asdict(entry) for entry in found], indent=1))
+    else:
+        print_findings(found)
+    if any(entry.level == "problem" for entry in found):
+        raise typer.Exit(1)
+
+
+@app.command("clean")
+def clean_command(
+    workspace: Workspace = None,
+    keep: Annotated[
+        int, typer.Option("--keep", min=0, help="Keep this many unused results of each stage.")
+    ] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Delete results that are not in use."""
+    from pipeline.workspace import clean
+
+    removed, freed = clean(workspace or _only_workspace(), keep=keep)
+    if as_json:
+        print(json.dumps({"removed": removed, "bytes": freed}, indent=1))
+    else:
+        for name in removed:
+            print(f"deleted {name}")
+        print(f"{len(removed)} results deleted, {freed / 2**20:.1f} MB freed")
+
+
+def _names(stages: str | None) -> list[str] | None:
+    if stages is None:
+        return None
+    return [name.strip() for name in stages.split(",") if name.strip()]
+
+
+def _only_workspace() -> Path:
+    """The workspace to speak of where none is named: this folder, or the only one under runs/."""
+    if Path("request.json").exists():
+        return Path()
+    found = sorted(path.parent for path in Path("runs").glob("*/request.json"))
+    if len(found) == 1:
+        return found[0]
+    some = f" ({', '.join(map(str, found[:5]))})" if found else ""
+    raise RequestError(f"Say which workspace: -w FOLDER{some}.")
+
+
+def main() -> NoReturn:
+    """Run the command line; every outcome has its exit status (DESIGN, section 5)."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    debug = "--debug" in sys.argv
+    try:
+        status = app(standalone_mode=False)
+    except PipelineError as error:
+        status = _fail(error, error.exit_status, debug)
+    except (KeyboardInterrupt, typer.Abort):
+        status = 130
+    except SystemExit as error:  # typer turns an interrupt into one of these
+        status = error.code
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 0
+    except Exception as error:
+        status = _unexpected(error, debug)
+    if status == 130:
+        print("Interrupted. Run the same command again to go on from here.", file=sys.stderr)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _interrupt(signum: int, frame: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _fail(error: BaseException, status: int, debug: bool) -> int:
+    if debug:
+        import traceback
+
+        traceback.print_exception(error)
+    print(f"\n{error}", file=sys.stderr)
+    if "--json" in sys.argv:
+        print(json.dumps({"error": str(error), "exit_status": status}))
+    return status
+
+
+def _unexpected(error: Exception, debug: bool) -> int:
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # click's usage errors
+        return _fail(RequestError(error.format_message()), 2, debug)
+    from pipeline.store import is_disk_full
+
+    if is_disk_full(error, Path.cwd()):
+        return _fail(
+            RequestError("The disk is full. Make room and run the same command again."), 2, debug
+        )
+    text = f"A fault of ours: {type(error).__name__}: {error}. Run again with --debug to see where."
+    if debug:
+        raise error
+    return _fail(PipelineError(text), 1, debug)

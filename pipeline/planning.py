@@ -1,0 +1,299 @@
+"""Which stages a request means, what each would compute from, and why a cached result is stale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import Config, result_fields
+from pipeline.errors import RequestError, nearest
+from pipeline.files import canonical_json, sha256_file, sha256_text
+from pipeline.stage import Stage, get_stage, stage_names
+from pipeline.store import Result, Store
+
+
+@dataclass(frozen=True)
+class Input:
+    """Where one input artifact comes from; `result` is None while its stage has yet to run."""
+
+    stage: str
+    kind: str
+    result: Result | None
+
+    @property
+    def content(self) -> str | None:
+        """Hash of the artifact's names and bytes."""
+        return self.result.contents[self.kind] if self.result else None
+
+
+@dataclass
+class PlannedStage:
+    """One stage of a request, as far as it can be known before running.
+
+    Attributes:
+        state: ``cached``, ``stale`` (a result exists, made from something else), ``missing``,
+            ``failed`` or ``pending`` (can't be known before an earlier stage has run).
+        reasons: what differs from the result in use.
+        key: None while pending.
+        material: what the key is the hash of.
+        sources: label -> file, for a stage that reads the user's files.
+    """
+
+    name: str
+    state: str
+    inputs: dict[str, Input]
+    reasons: list[str] = field(default_factory=list)
+    key: str | None = None
+    material: dict[str, Any] = field(default_factory=dict)
+    sources: Mapping[str, Path] = field(default_factory=dict)
+    result: Result | None = None
+    failure: str | None = None
+    resumable: bool = False
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The stages to run, in order, and what they take from the workspace as it is.
+
+    Attributes:
+        names: the stages of this run.
+        upstream: stages before the first one named, whose results in use are taken as they are.
+        implicit: those of `names` that run only because photographs were given.
+    """
+
+    names: tuple[str, ...]
+    upstream: tuple[str, ...] = ()
+    implicit: tuple[str, ...] = ()
+
+
+def resolve_chain(
+    config: Config,
+    stages: Sequence[str] | None,
+    from_stage: str | None,
+    images_named: bool,
+    store: Store,
+) -> Chain:
+    """Turn ``--stages`` and ``--from`` into the list of stages to run.
+
+    Named stages run in the order given and take their input from each other; what the first of them
+    needs from before comes from the workspace as it is in use. A stage that reads the photographs
+    runs first whenever photographs are named; otherwise what it read before is taken as it is.
+
+    Raises:
+        RequestError: an unknown stage, or one named twice.
+    """
+    order = config.run.stages
+    names = tuple(stages) if stages else order
+    for name in names:
+        get_stage(name)
+    if len(set(names)) < len(names):
+        raise RequestError(f"A stage is named twice in --stages {','.join(names)}.")
+    if from_stage is not None:
+        if from_stage not in names:
+            raise RequestError(
+                f"--from {from_stage}: the stages of this run are {', '.join(names)}."
+                f"{nearest(from_stage, names)}"
+            )
+        names = names[names.index(from_stage) :]
+    readers = tuple(name for name in order if get_stage(name).uses_sources)
+    implicit = tuple(name for name in readers if name not in names)
+    if images_named:
+        names = (*implicit, *names)
+    elif not stages and not from_stage:
+        names = tuple(n for n in names if n not in readers or store.current(n) is None)
+    first = next((name for name in names if name not in implicit), names[0])
+    position = order.index(first) if first in order else len(order)
+    upstream = tuple(name for name in order[:position] if name not in names)
+    return Chain(names, upstream, implicit)
+
+
+def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
+    """Artifact kind -> where it comes from, as the workspace offers it before the run.
+
+    Raises:
+        RequestError: a needed kind is provided by no earlier stage and the workspace has none.
+    """
+    table: dict[str, Input] = {}
+    for name in chain.upstream:
+        result = store.current(name)
+        for kind in result.contents if result else {}:
+            table[kind] = Input(name, kind, result)
+    available = set(table)
+    for name in chain.names:
+        stage = get_stage(name)
+        for kind in stage.requires:
+            if kind not in available:
+                raise RequestError(_nobody_provides(name, kind))
+        available |= set(stage.provides)
+    return table
+
+
+def _nobody_provides(name: str, kind: str) -> str:
+    makers = [n for n in stage_names() if kind in get_stage(n).provides and n != name]
+    from_where = f" ({' or '.join(makers)} would make them)" if makers else ""
+    if kind == "views":
+        return f"The stage '{name}' needs photographs: give a folder, files, a glob or a video."
+    return (
+        f"The stage '{name}' needs {kind}, which no earlier stage of this run provides and this "
+        f"workspace does not hold{from_where}. Add such a stage to --stages."
+    )
+
+
+def key_material(
+    stage: Stage,
+    config: Config,
+    inputs: Mapping[str, Input],
+    sources: Mapping[str, str],
+) -> dict[str, Any]:
+    """Everything that can change the stage's result; the key is the hash of it (DESIGN, 4)."""
+    return {
+        "stage": stage.name,
+        "version": stage.version,
+        "config": result_fields(config.sections[stage.name]),
+        "seed": config.run.seed,
+        "inputs": {kind: entry.content for kind, entry in sorted(inputs.items())},
+        "sources": [[label, digest] for label, digest in sources.items()],
+        "libraries": {name: library_version(name) for name in stage.libraries},
+    }
+
+
+def key_of(material: dict[str, Any]) -> str:
+    return sha256_text(canonical_json(material))
+
+
+@cache
+def library_version(name: str) -> str:
+    """Version of an installed distribution, ``"missing"`` where there is none."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def stage_inputs(stage: Stage, table: Mapping[str, Input]) -> dict[str, Input]:
+    """The part of the provider table that a stage takes."""
+    return {k: table[k] for k in (*stage.requires, *stage.optional) if k in table}
+
+
+def plan_stage(
+    name: str,
+    config: Config,
+    store: Store,
+    table: Mapping[str, Input],
+    images: Sequence[str | Path],
+) -> PlannedStage:
+    """Find out whether a stage's result exists, and if not, why not.
+
+    Args:
+        table: artifact kind -> provider, of all stages before this one.
+        images: what the user gave.
+
+    Raises:
+        RequestError: the photographs can't be found or read.
+    """
+    stage = get_stage(name)
+    inputs = stage_inputs(stage, table)
+    pointer = store.pointer(name)
+    failure = store.failure(name)
+    waiting = sorted({entry.stage for entry in inputs.values() if entry.result is None})
+    if waiting:
+        state = "pending" if pointer else "missing"
+        return PlannedStage(name, state, inputs, [f"depends on {' and '.join(waiting)}"])
+    sources = stage.sources(config.sections[name], {"images": list(images)})
+    hashes = {label: _hash_source(label, path) for label, path in sources.items()}
+    material = key_material(stage, config, inputs, hashes)
+    key = key_of(material)
+    planned = PlannedStage(name, "cached", inputs, [], key, material, sources)
+    planned.result = store.find(name, key)
+    if planned.result is None:
+        current = store.current(name)
+        planned.state = "stale" if current else "missing"
+        planned.reasons = (
+            explain(current.manifest["key_material"], material, inputs)
+            if current
+            else ["no result yet"]
+        )
+        planned.resumable = store.has_checkpoint(name, key)
+        if failure and failure.get("key") == key:
+            planned.state, planned.failure = "failed", failure["message"]
+    elif pointer and pointer["key"] == key:
+        planned.reasons = list(pointer.get("reasons", []))
+    return planned
+
+
+def _hash_source(label: str, path: Path) -> str:
+    try:
+        stat = path.stat()
+        return _hash_once(path, stat.st_size, stat.st_mtime_ns)
+    except OSError as error:
+        raise RequestError(
+            f"{label} can't be read ({error.strerror}). Mend or remove it."
+        ) from error
+
+
+@cache
+def _hash_once(path: Path, size: int, mtime_ns: int) -> str:
+    """A video is looked at several times in one process, but read once."""
+    return sha256_file(path)
+
+
+def explain(
+    old: Mapping[str, Any], new: Mapping[str, Any], inputs: Mapping[str, Input]
+) -> list[str]:
+    """Name each difference between two key materials, for people."""
+    reasons = []
+    stage = new["stage"]
+    before, after = _flatten(old["config"]), _flatten(new["config"])
+    for name in sorted(before.keys() | after.keys()):
+        if before.get(name) != after.get(name):
+            reasons.append(f"{stage}.{name} {_show(before, name)} → {_show(after, name)}")
+    for kind in sorted(old["inputs"].keys() | new["inputs"].keys()):
+        was, now = old["inputs"].get(kind), new["inputs"].get(kind)
+        if was == now:
+            continue
+        origin = f" (from {inputs[kind].stage})" if kind in inputs else ""
+        verb = "is new" if was is None else "is no longer used" if now is None else "changed"
+        reasons.append(f"input {kind}{origin} {verb}")
+    reasons += _explain_sources(dict(old["sources"]), dict(new["sources"]))
+    for name in sorted(old["libraries"].keys() | new["libraries"].keys()):
+        was, now = old["libraries"].get(name), new["libraries"].get(name)
+        if was != now:
+            reasons.append(f"library {name} {was} → {now}")
+    for name in ("version", "seed"):
+        if old[name] != new[name]:
+            reasons.append(f"{stage} {name} {old[name]} → {new[name]}")
+    if old["sources"] != new["sources"] and not reasons:
+        reasons.append("the order of the photographs changed")
+    return reasons
+
+
+def _explain_sources(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    reasons = []
+    for verb, labels in (
+        ("added", [label for label in new if label not in old]),
+        ("removed", [label for label in old if label not in new]),
+        ("changed", [label for label in new if label in old and old[label] != new[label]]),
+    ):
+        if labels:
+            shown = ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if labels[3:] else "")
+            reasons.append(f"input file {verb}: {shown}")
+    return reasons
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        flat |= (
+            _flatten(value, f"{prefix}{name}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{name}": value}
+        )
+    return flat
+
+
+def _show(flat: Mapping[str, Any], name: str) -> str:
+    return repr(flat[name]) if name in flat else "(absent)"

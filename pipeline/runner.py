@@ -1,0 +1,341 @@
+"""Plan -> reuse or run -> record: the one place where stages meet the store."""
+
+from __future__ import annotations
+
+import shutil
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import Config, load_config
+from pipeline.errors import PipelineError, RequestError, StageError
+from pipeline.measure import Measurement
+from pipeline.planning import (
+    Input,
+    PlannedStage,
+    plan_stage,
+    provider_table,
+    resolve_chain,
+)
+from pipeline.progress import Reporter
+from pipeline.request import Request, make_request
+from pipeline.stage import StageContext, get_stage
+from pipeline.store import CorruptResultError, Result, Store, is_disk_full
+
+
+@dataclass
+class StageOutcome:
+    """What a run did about one stage.
+
+    Attributes:
+        action: ``ran``, ``resumed`` (ran, from a checkpoint) or ``cached``; in a dry run ``would
+            run`` or ``unknown`` (depends on what an earlier stage will give).
+        reasons: why it ran.
+        figures: wall_seconds, cpu_seconds, peak_memory_mb of when it was computed, and `summary`.
+    """
+
+    name: str
+    action: str
+    reasons: list[str] = field(default_factory=list)
+    key: str | None = None
+    folder: Path | None = None
+    figures: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass
+class RunSummary:
+    """What a run did, and where its outputs lie."""
+
+    workspace: Path
+    stages: list[StageOutcome] = field(default_factory=list)
+    results: Path | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "workspace": str(self.workspace),
+            "results": str(self.results) if self.results else None,
+            "stages": [
+                {**vars(s), "folder": str(s.folder) if s.folder else None} for s in self.stages
+            ],
+        }
+
+
+class RunContext(StageContext):
+    """The context of a stage that runs for the store."""
+
+    def __init__(
+        self, planned: PlannedStage, config: Config, store: Store, folder: Path, reporter: Reporter
+    ) -> None:
+        self.config = config.sections[planned.name]
+        self.seed = config.run.seed
+        self.threads = config.threads
+        self.scratch = folder / "scratch"
+        self.sources = planned.sources
+        self.warnings: list[str] = []
+        self.figures: dict[str, Any] = {}
+        self.outputs: list[str] = []
+        self._planned = planned
+        self._store = store
+        self._folder = folder
+        self._reporter = reporter
+
+    def has(self, kind: str) -> bool:
+        return kind in self._planned.inputs
+
+    def load(self, kind: str) -> Any:
+        result = self._planned.inputs[kind].result
+        assert result is not None, f"{kind} is loaded before it was made"
+        return self._store.load(result, kind)
+
+    def output(self, kind: str) -> Path:
+        stage = get_stage(self._planned.name)
+        assert kind in stage.provides, f"{stage.name} does not declare that it provides {kind}"
+        path = self._folder / kind
+        path.mkdir(exist_ok=True)
+        if kind not in self.outputs:
+            self.outputs.append(kind)
+        return path
+
+    def progress(self, step: str, done: int, total: int, **figures: float | int | str) -> None:
+        self._reporter.progress(self._planned.name, step, done, total, **figures)
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+        self._reporter.message(f"{self._planned.name}: {message}")
+
+    def summarize(self, **figures: float | int | str) -> None:
+        self.figures.update(figures)
+
+
+def run(
+    images: Sequence[str | Path] | str | Path = (),
+    *,
+    workspace: str | Path | None = None,
+    preset: str | Path | None = None,
+    overrides: Iterable[str] | Mapping[str, Any] = (),
+    stages: Sequence[str] | None = None,
+    from_stage: str | None = None,
+    force: bool = False,
+    dry_run: bool = False,
+    reporter: Reporter | None = None,
+) -> RunSummary:
+    """Run the pipeline on photographs, reusing every result that is still valid.
+
+    Args:
+        images: a folder, files, a glob pattern or one video; empty to use what the workspace was
+            last run on.
+        workspace: where results are kept; default ``./runs/<name of the input>``.
+        preset: name or YAML file of a preset.
+        overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.
+        stages: names of the stages to run, in order; default all of the preset.
+        from_stage: begin here, with what the workspace holds from before.
+        force: compute the stages anew although a valid result exists.
+        dry_run: only say what would be done.
+        reporter: hears of the progress.
+
+    Raises:
+        RequestError: the request is wrong. ReconstructionError: the data can't be reconstructed.
+        StageError: a fault of ours.
+    """
+    request = make_request(images, workspace, preset, overrides, stages, from_stage)
+    config = load_config(request.preset, request.overrides)
+    return Runner(request, config, reporter or Reporter()).run(force=force, dry_run=dry_run)
+
+
+class Runner:
+    """One request on one workspace."""
+
+    def __init__(self, request: Request, config: Config, reporter: Reporter) -> None:
+        self.request = request
+        self.config = config
+        self.reporter = reporter
+        self.store = Store(request.workspace)
+        self.chain = resolve_chain(
+            config, request.stages, request.from_stage, request.images_named, self.store
+        )
+
+    def plan(self) -> list[PlannedStage]:
+        """Look at every stage without running any."""
+        table = provider_table(self.chain, self.store)
+        planned = []
+        for name in self.chain.names:
+            stage = plan_stage(name, self.config, self.store, table, self.request.images)
+            planned.append(stage)
+            for kind in get_stage(name).provides:
+                table[kind] = Input(name, kind, stage.result)
+        return planned
+
+    def run(self, *, force: bool = False, dry_run: bool = False) -> RunSummary:
+        if dry_run:
+            return self._dry_run(force)
+        self.plan()  # a wrong request is refused before anything is written
+        self.store.create()
+        self.request.save()
+        self.reporter.start(list(self.chain.names))
+        try:
+            self._check_upstream()
+            return self._run_all(force)
+        finally:
+            self.reporter.stop()
+
+    def _dry_run(self, force: bool) -> RunSummary:
+        summary = RunSummary(self.request.workspace)
+        for stage in self.plan():
+            forced = force and stage.name not in self.chain.implicit
+            if stage.state == "cached":
+                action, reasons = ("would run", ["--force"]) if forced else ("cached", [])
+            else:
+                action = "unknown" if stage.state == "pending" else "would run"
+                reasons = stage.reasons
+            summary.stages.append(StageOutcome(stage.name, action, reasons, stage.key))
+        return summary
+
+    def _check_upstream(self) -> None:
+        """Warn where the results taken as they are do not fit together."""
+        contents: dict[str, str] = {}
+        for name in self.chain.upstream:
+            result = self.store.current(name)
+            if result is None:
+                continue
+            made_from = result.manifest["key_material"]["inputs"]
+            for kind, content in made_from.items():
+                if contents.get(kind, content) != content:
+                    self.reporter.message(
+                        f"The result of '{name}' in use was computed from other {kind} than those "
+                        f"now in use; it is taken as it is. Run with --from {name} to renew it."
+                    )
+            contents.update(result.contents)
+
+    def _run_all(self, force: bool) -> RunSummary:
+        done: set[str] = set()  # forced stages are forced once, also after a repair
+        for _ in range(len(self.chain.names) + 2):
+            try:
+                return self._run_once(force, done)
+            except CorruptResultError as error:
+                if error.stage not in self.chain.names:
+                    raise RequestError(
+                        f"The cached result of '{error.stage}' is damaged ({error}) and was moved "
+                        f"aside. Run again with --from {error.stage} to make it anew."
+                    ) from None
+        raise StageError("Cached results were found damaged again and again; is the disk sound?")
+
+    def _run_once(self, force: bool, done: set[str]) -> RunSummary:
+        summary = RunSummary(self.request.workspace)
+        table = provider_table(self.chain, self.store)
+        for name in self.chain.names:
+            planned = plan_stage(name, self.config, self.store, table, self.request.images)
+            must = force and name not in done and name not in self.chain.implicit
+            outcome, result = self._reuse_or_run(planned, must)
+            done.add(name)
+            summary.stages.append(outcome)
+            for kind in result.contents:
+                table[kind] = Input(name, kind, result)
+                if kind == "exports":
+                    summary.results = self.store.link_results(result, kind)
+        return summary
+
+    def _reuse_or_run(self, planned: PlannedStage, force: bool) -> tuple[StageOutcome, Result]:
+        name, key = planned.name, planned.key
+        assert key is not None, f"{name} was planned before its inputs were there"
+        if planned.result is not None and not force:
+            self.store.use(planned.result, planned.reasons)
+            return self._cached(planned.result), planned.result
+        with self.store.lock(name, self.reporter.message):
+            result = self.store.find(name, key)
+            if result is not None and not force:  # another process has just made it
+                self.store.use(result, planned.reasons)
+                return self._cached(result), result
+            resumed = self.store.has_checkpoint(name, key)
+            reasons = ["--force"] if force and planned.state == "cached" else planned.reasons
+            self.reporter.stage_started(name, reasons, resumed)
+            previous = result
+            result = self._compute(planned, reasons)
+            self.store.use(result, reasons)
+        figures = _figures(result)
+        self.reporter.stage_finished(name, False, figures)
+        if previous is not None and previous.contents != result.contents:
+            self.reporter.message(
+                f"{name}: computing again gave other bytes than before; please report this."
+            )
+        outcome = StageOutcome(
+            name, "resumed" if resumed else "ran", reasons, key, result.folder, figures,
+            result.manifest["warnings"],
+        )  # fmt: skip
+        return outcome, result
+
+    def _cached(self, result: Result) -> StageOutcome:
+        figures = _figures(result)
+        self.reporter.stage_finished(result.stage, True, figures)
+        return StageOutcome(
+            result.stage, "cached", [], result.key, result.folder, figures,
+            result.manifest["warnings"],
+        )  # fmt: skip
+
+    def _compute(self, planned: PlannedStage, reasons: list[str]) -> Result:
+        name, key = planned.name, planned.key
+        assert key is not None
+        stage = get_stage(name)
+        try:
+            folder = self.store.begin(name, key)
+            context = RunContext(planned, self.config, self.store, folder, self.reporter)
+            with Measurement() as measurement:
+                stage.run(context)
+            missing = [kind for kind in stage.provides if kind not in context.outputs]
+            if missing:
+                raise StageError(f"The stage '{name}' ended without writing {', '.join(missing)}.")
+            manifest = {
+                "key_material": planned.material,
+                "config": self.config.sections[name].model_dump(mode="json"),
+                "seed": self.config.run.seed,
+                "inputs": {
+                    kind: {"stage": entry.stage, "content": entry.content}
+                    for kind, entry in planned.inputs.items()
+                },
+                "reasons": reasons,
+                "threads": self.config.threads,
+                "summary": context.figures,
+                "warnings": context.warnings,
+                **measurement.figures,
+            }
+            return self.store.commit(name, key, manifest, list(stage.provides))
+        except (KeyboardInterrupt, CorruptResultError):
+            raise
+        except Exception as error:
+            raise self._explain_failure(error, name, key) from error
+
+    def _explain_failure(self, error: Exception, name: str, key: str) -> PipelineError:
+        """Turn any failure into one paragraph, and leave the store as it was."""
+        if is_disk_full(error, self.request.workspace):
+            free = shutil.disk_usage(self.request.workspace).free / 2**20
+            failure: PipelineError = RequestError(
+                f"The disk that holds the workspace {self.request.workspace} is full ({free:.1f} "
+                f"MB left); the stage '{name}' could not write its result. Nothing computed before "
+                "is lost: make room ('pipeline clean' deletes results that are not in use) and run "
+                "the same command again."
+            )
+        elif isinstance(error, PipelineError):
+            failure = error
+        elif isinstance(error, MemoryError):
+            failure = StageError(
+                f"The stage '{name}' needs more memory than there is. Use fewer photographs "
+                "(--frames) or a smaller working size (--set views.long_side=384)."
+            )
+        else:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            failure = StageError(
+                f"The stage '{name}' failed with a fault of ours: {type(error).__name__}: {error} "
+                f"({Path(where.filename).name}, line {where.lineno}). What earlier stages computed "
+                "is kept. Run again with --debug for the whole trace, and please report it."
+            )
+        self.store.discard_outputs(name, key)
+        self.store.record_failure(name, key, str(failure))
+        return failure
+
+
+def _figures(result: Result) -> dict[str, Any]:
+    names = ("wall_seconds", "cpu_seconds", "peak_memory_mb", "summary")
+    return {name: result.manifest[name] for name in names}

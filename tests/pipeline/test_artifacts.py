@@ -1,0 +1,149 @@
+"""Every artifact kind: what is saved is loaded, and the bytes repeat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts import KINDS, Artifact, artifact_class
+from pipeline.artifacts.cameras import Camera, Cameras, read_colmap
+from pipeline.artifacts.flow import Flow, FlowPair
+from pipeline.artifacts.gaussians import Gaussians, ply_properties
+from pipeline.artifacts.metrics import Metrics
+from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
+from pipeline.artifacts.points import Points
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import RequestError
+
+
+def rigid(rng: np.random.Generator) -> np.ndarray:
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = np.eye(4)
+    pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    pose[:3, 3] = rng.normal(size=3)
+    return pose
+
+
+def samples() -> dict[str, Artifact]:
+    """One artifact of each kind that holds arrays, with mixed image sizes."""
+    rng = np.random.default_rng(0)
+
+    def floats(*shape: int) -> np.ndarray:
+        return rng.uniform(size=shape).astype(np.float32)
+
+    def pixels(*shape: int) -> np.ndarray:
+        return (rng.integers(0, 256, shape) / np.float32(255)).astype(np.float32)
+
+    mask = rng.uniform(size=(5, 7)) > 0.5
+    return {
+        "views": Views(
+            (
+                View("000", pixels(5, 7, 3), mask, source_name="a.jpg", focal_px=31.5),
+                View("001", pixels(8, 6, 3), working_from_source=np.diag([2.0, 2, 1])),
+            ),
+            ordered=True,
+        ),
+        "pointmaps": Pointmaps(
+            [
+                PointmapPair(
+                    "000", "001", floats(5, 7, 3), floats(8, 6, 3), floats(5, 7), floats(8, 6)
+                )
+            ]
+        ),
+        "cameras": Cameras(
+            (
+                Camera("000", 7, 5, 9.1, 9.2, 3.5, 2.5, rigid(rng)),
+                Camera("001", 6, 8, 9.0, 9.0, 3.0, 4.0, rigid(rng)),
+            ),
+            input_from_world=np.diag([2.0, 2, 2, 1]),
+            units="mm",
+        ),
+        "points": Points(floats(9, 3), pixels(9, 3), floats(9, 3), 1 + floats(9), floats(9)),
+        "flow": Flow((FlowPair("000", "001", floats(5, 7, 2), floats(8, 6, 2), mask, mask),)),
+        "gaussians": Gaussians(
+            floats(9, 3), floats(9, 4), floats(9, 3), floats(9), floats(9, 16, 3)
+        ),
+        "metrics": Metrics({"mean": {"psnr": 31.25}, "unplaced": []}),
+    }
+
+
+def assert_same(a: object, b: object) -> None:
+    if isinstance(a, np.ndarray):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+        assert a.dtype == b.dtype  # type: ignore[attr-defined]
+    elif isinstance(a, Pointmaps):
+        for left, right in zip(a, b, strict=True):  # type: ignore[call-overload]
+            assert_same(vars(left), vars(right))
+    elif isinstance(a, tuple | list):
+        assert len(a) == len(b)  # type: ignore[arg-type]
+        for left, right in zip(a, b, strict=True):  # type: ignore[call-overload]
+            assert_same(left, right)
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()  # type: ignore[attr-defined]
+        for key in a:
+            assert_same(a[key], b[key])  # type: ignore[index]
+    elif hasattr(a, "__dataclass_fields__"):
+        assert_same(vars(a), vars(b))
+    else:
+        assert a == b
+
+
+def test_samples_cover_every_kind() -> None:
+    assert set(samples()) | {"exports"} == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"exports"}))
+def test_saved_is_loaded_and_bytes_repeat(kind: str, tmp_path: Path) -> None:
+    artifact = samples()[kind]
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir(), second.mkdir()
+    artifact.save(first)
+    loaded = artifact_class(kind).load(first)
+    assert_same(artifact, loaded)
+    artifact.save(second)
+    files = sorted(p.relative_to(first) for p in first.rglob("*") if p.is_file())
+    assert files
+    for name in files:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def test_unknown_kind_names_the_nearest() -> None:
+    with pytest.raises(RequestError, match="Did you mean 'points'"):
+        artifact_class("pionts")
+
+
+def test_projection_and_unprojection_are_inverse() -> None:
+    camera = samples()["cameras"].cameras[0]  # type: ignore[attr-defined]
+    depth = np.full((5, 7), 2.5)
+    world = camera.unproject(depth)
+    pixels, z = camera.project(world.reshape(-1, 3))
+    v, u = np.mgrid[:5, :7] + 0.5
+    np.testing.assert_allclose(pixels, np.stack([u, v], -1).reshape(-1, 2), atol=1e-9)
+    np.testing.assert_allclose(z, 2.5)
+    half, _ = camera.resized(14, 10).project(world.reshape(-1, 3))
+    np.testing.assert_allclose(half, pixels * 2, atol=1e-9)
+
+
+def test_gaussian_ply_has_the_standard_properties(tmp_path: Path) -> None:
+    samples()["gaussians"].save(tmp_path)
+    header = (tmp_path / "gaussians.ply").read_bytes().split(b"end_header")[0].decode()
+    names = [line.split()[-1] for line in header.splitlines() if line.startswith("property float")]
+    assert names == ply_properties()
+    assert len(names) == 62
+
+
+def test_cameras_with_distortion_are_refused(tmp_path: Path) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_RADIAL", width=8, height=6, params=[9, 4, 3, 0.1]
+    )
+    model.add_camera_with_trivial_rig(lens)
+    image = pycolmap.Image(name="000.png", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.eye(4)[:3]))
+    model.write_text(str(tmp_path))
+    with pytest.raises(ValueError, match="undistort"):
+        read_colmap(tmp_path)

@@ -1,0 +1,171 @@
+"""The command line on toy stages, in processes of its own: exit statuses, messages, kills."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_runner import artifact_bytes
+
+TOY = Path(__file__).parent / "toy.py"
+
+
+def command(folder: Path, *arguments: str) -> list[str]:
+    """The command line of a toy pipeline in `folder`, whose preset and images are there."""
+    return [sys.executable, str(TOY), *arguments]
+
+
+def call(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(folder, *arguments), cwd=folder, capture_output=True, text=True, timeout=60
+    )
+
+
+RUN = ("run", "images", "-w", "w", "-c", "toy.yaml")
+
+
+def test_no_arguments_teaches_by_example(toys: Path) -> None:
+    done = call(toys)
+    assert done.returncode == 0
+    assert "pipeline run photos/" in done.stdout
+    assert "--stages init,sap,fit" in done.stdout
+
+
+def test_run_ends_with_a_summary(toys: Path) -> None:
+    done = call(toys, *RUN)
+    assert done.returncode == 0, done.stderr
+    for text in ("count", "seconds", "MB", "views 3", "this is only a toy", "w/results"):
+        assert text in done.stdout
+    assert "count: starts (no result yet)" in done.stderr
+    again = call(toys, *RUN)
+    assert again.stderr.count("cached") == 4
+
+
+def test_json_is_json(toys: Path) -> None:
+    summary = json.loads(call(toys, *RUN, "--json").stdout)
+    assert [stage["action"] for stage in summary["stages"]] == ["ran"] * 4
+    states = json.loads(call(toys, "status", "-w", "w", "--json").stdout)
+    assert [stage["state"] for stage in states] == ["cached"] * 4
+    assert json.loads(call(toys, "clean", "-w", "w", "--json").stdout)["removed"] == []
+    wrong = call(toys, *RUN, "--json", "--set", "count.step=1")
+    assert json.loads(wrong.stdout)["exit_status"] == 2
+
+
+def test_status_tells_why(toys: Path) -> None:
+    call(toys, *RUN)
+    done = call(toys, "status", "-w", "w", "--set", "scale.factor=3")
+    assert "scale.factor 2.0 → 3.0" in done.stdout
+    assert "depends on scale" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "text"),
+    [
+        ((*RUN, "--stages", "red"), 2, "Unknown stage 'red'"),
+        ((*RUN, "--set", "scale.factor=70"), 2, "scale.factor=70 is not allowed"),
+        ((*RUN, "--set", "count.fail=data"), 3, "share too little"),
+        ((*RUN, "--set", "count.fail=bug"), 1, "fault of ours"),
+        ((*RUN, "--set", "count.fail=disk"), 2, "is full"),
+        ((*RUN, "--nonsense"), 2, "nonsense"),
+        (("run",), 2, "Give the photographs"),
+        (("status",), 2, "Say which workspace"),
+        (("frobnicate",), 2, "frobnicate"),
+    ],
+)
+def test_failure_is_one_paragraph_with_its_status(
+    toys: Path, arguments: tuple[str, ...], status: int, text: str
+) -> None:
+    done = call(toys, *arguments)
+    assert done.returncode == status, done.stderr
+    paragraph = done.stderr.strip().rpartition("\n")[2]
+    assert text in paragraph
+    assert "Traceback" not in done.stderr
+
+
+def test_debug_shows_the_trace(toys: Path) -> None:
+    done = call(toys, *RUN, "--set", "count.fail=bug", "--debug")
+    assert done.returncode == 1
+    assert "ZeroDivisionError" in done.stderr and "Traceback" in done.stderr
+
+
+def test_unwritable_workspace_is_refused(toys: Path) -> None:
+    (toys / "w").write_text("a file, not a folder")
+    done = call(toys, *RUN)
+    assert done.returncode == 2
+    assert "can't be written to" in done.stderr
+
+
+def test_really_full_disk(toys: Path) -> None:
+    """A file system of 64 KB: the paragraph comes, and the run succeeds once there is room."""
+    small = toys / "small"
+    small.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(small)], capture_output=True
+    )
+    if mount.returncode != 0:
+        pytest.skip("mounting a small file system needs root")
+    try:
+        done = call(toys, "run", "images", "-w", str(small / "w"), "-c", "toy.yaml")
+        assert done.returncode == 2, done.stderr
+        assert "is full" in done.stderr and "Nothing computed before is lost" in done.stderr
+        subprocess.run(["mount", "-o", "remount,size=4m", str(small)], check=True)
+        again = call(toys, "run", "images", "-w", str(small / "w"), "-c", "toy.yaml")
+        assert again.returncode == 0, again.stderr
+        assert "scale: cached" in again.stderr
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
+def test_interrupt_is_resumable(toys: Path) -> None:
+    slow = (*RUN, "--set", "count.step_seconds=0.05")
+    process = subprocess.Popen(command(toys, *slow), cwd=toys, stderr=subprocess.PIPE, text=True)
+    wait_for_checkpoint(toys / "w")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30) == 130
+    assert "Run the same command again" in process.stderr.read()  # type: ignore[union-attr]
+    assert "goes on from its checkpoint" in call(toys, *slow).stderr
+
+
+def wait_for_checkpoint(workspace: Path) -> None:
+    for _ in range(600):
+        if any(workspace.glob("count/*.partial/scratch/checkpoint.json")):
+            return
+        time.sleep(0.02)
+    raise AssertionError("the run never came to its checkpoint")
+
+
+def test_kill_at_any_moment_changes_no_byte(toys: Path) -> None:
+    whole = call(toys, *RUN[:3], "whole", *RUN[4:])
+    assert whole.returncode == 0
+    seconds = 0.01
+    slow = (*RUN, "--set", f"count.step_seconds={seconds}")
+    moments = random.Random(0)
+    killed = 0
+    for _ in range(8):
+        process = subprocess.Popen(
+            command(toys, *slow), cwd=toys, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        time.sleep(moments.uniform(0.1, 0.9))
+        process.kill()
+        killed += process.wait() == -signal.SIGKILL
+    assert killed
+    final = call(toys, *slow)
+    assert final.returncode == 0, final.stderr
+    assert artifact_bytes(toys / "w") == artifact_bytes(toys / "whole")
+    assert not [p for p in (toys / "w").rglob("*") if p.name.endswith((".partial", ".tmp"))]
+
+
+def test_help_is_quick_to_import() -> None:
+    """`pipeline --help` must not import numpy, let alone heavier things."""
+    code = "import sys, pipeline.cli; print({'numpy', 'cv2', 'torch'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ, check=True
+    )
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,81 @@
+"""Presets, overrides, and the paragraphs that refuse wrong ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config import _parse_override, load_config, presets, result_fields
+from pipeline.errors import RequestError
+from pipeline.request import _yaml_value
+
+
+def test_override_reaches_the_stage(toys: Path) -> None:
+    config = load_config(toys / "toy.yaml", ["scale.factor=3.5", "seed=7"])
+    assert config.sections["scale"].factor == 3.5  # type: ignore[attr-defined]
+    assert config.run.seed == 7
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("scale.factr=3", r"'scale.factr' is not a setting. Did you mean 'factor'\?"),
+        ("scal.factor=3", r"'scal' is neither a stage nor a setting.*Did you mean 'scale'\?"),
+        ("scale.factor=70", r"scale.factor=70 is not allowed: .*less than 10.*multiply with"),
+        ("scale.factor=many", r"scale.factor='many' is not allowed: .*number"),
+        ("scale=3", "'scale' must hold key: value pairs"),
+        ("stages=[read, nothing]", "Unknown stage 'nothing'"),
+        ("scale.factor", "--set takes stage.key=value"),
+        ("scale.factor=[1", "can't be read"),
+    ],
+)
+def test_wrong_override_is_explained(toys: Path, override: str, text: str) -> None:
+    with pytest.raises(RequestError, match=text):
+        load_config(toys / "toy.yaml", [override])
+
+
+def test_presets_extend_each_other(toys: Path) -> None:
+    (toys / "a.yaml").write_text("extends: toy.yaml\nscale: {factor: 4}\ncount: {steps: 3}\n")
+    (toys / "b.yaml").write_text("extends: a.yaml\nscale: {factor: 5}\n")
+    config = load_config(toys / "b.yaml")
+    assert config.sections["scale"].factor == 5  # type: ignore[attr-defined]
+    assert config.sections["count"].steps == 3  # type: ignore[attr-defined]
+    (toys / "a.yaml").write_text("extends: b.yaml\n")
+    with pytest.raises(RequestError, match="in a circle"):
+        load_config(toys / "b.yaml")
+
+
+def test_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(RequestError, match="Did you mean 'dentalsplat'"):
+        load_config("dentalsplot")
+
+
+def test_unreadable_preset_is_refused(toys: Path) -> None:
+    (toys / "broken.yaml").write_text("a: [1")
+    with pytest.raises(RequestError, match="can't be read"):
+        load_config(toys / "broken.yaml")
+
+
+@pytest.mark.parametrize("name", sorted(presets()))
+def test_every_preset_is_valid(name: str) -> None:
+    assert load_config(name).run.stages
+
+
+def test_real_quantile_out_of_range_is_refused() -> None:
+    with pytest.raises(RequestError, match=r"sap.quantile=7 is not allowed"):
+        load_config(None, ["sap.quantile=7"])
+
+
+def test_runtime_fields_stay_out_of_the_result(toys: Path) -> None:
+    section = load_config(toys / "toy.yaml").sections["scale"]
+    assert result_fields(section) == {"factor": 2.0, "round": False}
+
+
+@given(st.one_of(st.integers(), st.floats(allow_nan=False), st.booleans(), st.text(), st.none()))
+def test_values_survive_the_command_line(value: object) -> None:
+    key, parsed = _parse_override(f"a.b={_yaml_value(value)}")
+    assert key == "a.b"
+    assert parsed == value

@@ -1,0 +1,227 @@
+"""Reuse, early cut-off, chains of stages, failures and resuming, on toy stages."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pipeline
+from pipeline.store import Store
+
+ALL_RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
+ALL_CACHED = dict.fromkeys(ALL_RAN, "cached")
+
+
+def artifact_bytes(workspace: Path) -> dict[str, bytes]:
+    """Bytes of all artifacts of all committed results; the manifests hold timings."""
+    return {
+        str(path.relative_to(workspace)): path.read_bytes()
+        for path in sorted(workspace.rglob("*"))
+        if path.is_file() and len(path.relative_to(workspace).parts) > 3
+    }
+
+
+def test_second_run_computes_nothing(run: Any) -> None:
+    assert run() == ALL_RAN
+    assert run() == ALL_CACHED
+
+
+def test_going_back_is_a_hit(run: Any) -> None:
+    run()
+    changed = run("scale.factor=3")
+    assert changed == {"read": "cached", "scale": "ran", "count": "ran", "publish": "ran"}
+    assert run() == ALL_CACHED
+    assert run("scale.factor=3") == ALL_CACHED
+
+
+def test_runtime_fields_and_threads_are_not_in_the_key(run: Any) -> None:
+    run()
+    assert run("scale.log_every=7", "threads=1") == ALL_CACHED
+
+
+def test_early_cut_off_when_the_bytes_stay_the_same(run: Any) -> None:
+    run()
+    after = run("scale.round=true")  # 2.0 rounds to 2: other config, same numbers
+    assert after["scale"] == "ran"
+    assert after["count"] == after["publish"] == "cached"
+
+
+def test_changed_input_file_reruns_what_depends_on_it(run: Any, toys: Path) -> None:
+    run()
+    (toys / "images" / "1.txt").write_text("2.0")  # other bytes, the same number
+    after = run()
+    assert after == {**ALL_CACHED, "read": "ran"}
+    (toys / "images" / "1.txt").write_text("5")
+    assert run() == ALL_RAN
+
+
+def test_named_stages_take_the_rest_from_the_workspace(run: Any) -> None:
+    run()
+    assert run("count.steps=5", stages=["count"], images=()) == {"count": "ran"}
+    assert run("count.steps=5", stages=["read", "count"]) == {"read": "cached", "count": "ran"}
+
+
+def test_stage_without_its_input_is_refused(run: Any, toys: Path) -> None:
+    with pytest.raises(pipeline.RequestError, match=r"'publish' needs metrics.*count would make"):
+        run(stages=["read", "publish"])
+    assert not (toys / "w").exists()
+
+
+def test_from_begins_in_the_middle(run: Any) -> None:
+    run()
+    assert run("count.steps=3", from_stage="count") == {
+        "read": "cached", "count": "ran", "publish": "ran"
+    }  # fmt: skip
+
+
+def test_from_warns_of_results_that_do_not_fit_together(run: Any, toys: Path) -> None:
+    class Ears(pipeline.runner.Reporter):
+        heard: list[str] = []  # noqa: RUF012
+
+        def message(self, text: str) -> None:
+            self.heard.append(text)
+
+    run()
+    run("read.keep=2", stages=["read"])
+    run(from_stage="publish", images=(), reporter=Ears())
+    assert any("'scale' in use was computed from other numbers" in text for text in Ears.heard)
+
+
+def test_unknown_and_repeated_stages_are_refused(run: Any) -> None:
+    with pytest.raises(pipeline.RequestError, match=r"Unknown stage 'scal'.*'scale'"):
+        run(stages=["read", "scal"])
+    with pytest.raises(pipeline.RequestError, match="named twice"):
+        run(stages=["read", "scale", "read"])
+    with pytest.raises(pipeline.RequestError, match="--from nowhere"):
+        run(from_stage="nowhere")
+
+
+def test_force_computes_anew_and_once(run: Any) -> None:
+    run()
+    assert run(force=True) == ALL_RAN
+    assert run(force=True, stages=["scale"], images=()) == {"scale": "ran"}
+
+
+def test_dry_run_tells_and_does_nothing(run: Any, toys: Path) -> None:
+    assert run(dry_run=True) == {
+        "read": "would run", "scale": "would run", "count": "would run", "publish": "would run"
+    }  # fmt: skip
+    assert not (toys / "w").exists()
+    run()
+    before = artifact_bytes(toys / "w")
+    assert run("scale.factor=3", dry_run=True) == {
+        "read": "cached", "scale": "would run", "count": "unknown", "publish": "unknown"
+    }  # fmt: skip
+    assert artifact_bytes(toys / "w") == before
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "text"),
+    [
+        ("data", "ReconstructionError", "share too little"),
+        ("bug", "StageError", r"a fault of ours: ZeroDivisionError: oops \(toy.py, line \d+\)"),
+        ("disk", "RequestError", "is full .* Nothing computed before is lost"),
+    ],
+)
+def test_failure_keeps_what_was_computed(
+    run: Any, toys: Path, how: str, error: str, text: str
+) -> None:
+    with pytest.raises(getattr(pipeline, error), match=text):
+        run(f"count.fail={how}")
+    states = {s.name: s.state for s in pipeline.status(workspace=toys / "w")}
+    assert states == {"read": "cached", "scale": "cached", "count": "failed", "publish": "missing"}
+    failed = pipeline.status(workspace=toys / "w")[2]
+    assert failed.failure
+    assert run() == {"read": "cached", "scale": "cached", "count": "ran", "publish": "ran"}
+    assert all(s.failure is None for s in pipeline.status(workspace=toys / "w"))
+
+
+def test_interrupted_stage_resumes_to_the_same_bytes(run: Any, toys: Path) -> None:
+    run("count.steps=31")
+    whole = artifact_bytes(toys / "w")
+    (toys / "w").rename(toys / "w1")
+    with pytest.raises(KeyboardInterrupt):
+        run("count.steps=31", "count.fail=interrupt")
+    # The failing config has another key, so its checkpoint is not touched by the other.
+    assert run("count.steps=31")["count"] == "ran"
+    with pytest.raises(KeyboardInterrupt):
+        run("count.steps=33", "count.fail=interrupt")
+    assert pipeline.status(workspace=toys / "w")[2].resumable
+    assert run("count.steps=33", "count.fail=interrupt")["count"] == "resumed"
+    run("count.steps=31")
+    now = artifact_bytes(toys / "w")
+    assert {name: now[name] for name in whole} == whole
+
+
+def test_damaged_result_is_set_aside_and_made_anew(
+    run: Any, toys: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run()
+    workspace = toys / "w"
+    whole = artifact_bytes(workspace)
+    victim = next(name for name in whole if name.startswith("scale/"))
+    (workspace / victim).write_text(whole[victim].decode().replace("8", "9"))  # same size
+    after = run("count.steps=7")  # loads it: the checksum tells
+    assert after["scale"] == "ran"
+    assert "damaged" in capsys.readouterr().err
+    assert (workspace / victim).read_bytes() == whole[victim]
+    (workspace / victim).write_text("short")  # the size tells, without loading
+    assert run("count.steps=7")["scale"] == "ran"
+    assert (workspace / victim).read_bytes() == whole[victim]
+
+
+def test_result_without_manifest_never_existed(run: Any, toys: Path) -> None:
+    run()
+    folder = Store(toys / "w").current("count").folder  # type: ignore[union-attr]
+    (folder / "manifest.json").unlink()
+    assert run() == {**ALL_CACHED, "count": "ran"}
+
+
+def test_two_processes_share_one_computation(run: Any, toys: Path) -> None:
+    outcomes: list[dict[str, str]] = []
+    threads = [
+        threading.Thread(target=lambda: outcomes.append(run("count.step_seconds=0.02")))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.1)
+    for thread in threads:
+        thread.join()
+    assert sorted(outcome["count"] for outcome in outcomes) == ["cached", "ran"]
+
+
+def test_results_link_follows_the_setting(run: Any, toys: Path) -> None:
+    run("publish.title=first")
+    run("publish.title=second")
+    assert (toys / "w" / "results" / "viewer.html").read_text().startswith("second")
+    run("publish.title=first")
+    assert (toys / "w" / "results" / "viewer.html").read_text().startswith("first")
+
+
+def test_manifest_tells_everything(run: Any, toys: Path) -> None:
+    run()
+    result = Store(toys / "w").current("count")
+    assert result is not None
+    manifest = json.loads((result.folder / "manifest.json").read_text())
+    assert manifest["stage"] == "count"
+    assert manifest["key"].startswith(result.folder.name)
+    assert manifest["config"]["steps"] == 30
+    assert manifest["inputs"]["numbers"]["stage"] == "scale"
+    assert manifest["warnings"] == ["this is only a toy"]
+    assert set(manifest["outputs"]["metrics"]["files"]) == {
+        "metrics.json", *(f"step_{k}.txt" for k in range(5))
+    }  # fmt: skip
+    assert manifest["wall_seconds"] >= 0
+    assert manifest["peak_memory_mb"] > 1
+
+
+def test_workspace_remembers_its_photographs(run: Any) -> None:
+    run()
+    assert run("scale.factor=5", images=()) == {"scale": "ran", "count": "ran", "publish": "ran"}
+    assert run("read.keep=1", images=(), stages=["read", "scale"])["read"] == "ran"

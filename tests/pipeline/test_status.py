@@ -1,0 +1,72 @@
+"""`status` names the field or the input that made a stage stale; `clean` spares what is in use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pipeline
+
+
+def states(toys: Path, *overrides: str) -> dict[str, tuple[str, list[str]]]:
+    found = pipeline.status(workspace=toys / "w", overrides=overrides)
+    return {stage.name: (stage.state, stage.reasons) for stage in found}
+
+
+def test_names_the_field(run: Any, toys: Path) -> None:
+    run()
+    asked = states(toys, "scale.factor=3")
+    assert asked["scale"] == ("stale", ["scale.factor 2.0 → 3.0"])
+    assert asked["count"] == ("pending", ["depends on scale"])
+    run("scale.factor=3")
+    assert states(toys)["scale"] == ("cached", ["scale.factor 2.0 → 3.0"])
+    assert states(toys)["count"] == ("cached", ["input numbers (from scale) changed"])
+
+
+def test_names_the_input_file(run: Any, toys: Path) -> None:
+    run()
+    (toys / "images" / "1.txt").write_text("7")
+    assert states(toys)["read"] == ("stale", ["input file changed: 1.txt"])
+    (toys / "images" / "9.txt").write_text("7")
+    assert states(toys)["read"][1] == ["input file added: 9.txt", "input file changed: 1.txt"]
+
+
+def test_names_library_seed_and_version(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run()
+    assert states(toys, "seed=5")["read"] == ("stale", ["read seed 0 → 5"])
+    monkeypatch.setattr("pipeline.planning.library_version", lambda name: "0.0.1")
+    (reason,) = states(toys)["scale"][1]
+    assert reason.startswith("library numpy") and reason.endswith("→ 0.0.1")
+    monkeypatch.undo()
+
+
+def test_stages_never_run_are_missing(run: Any, toys: Path) -> None:
+    run(stages=["read", "scale"])
+    found = pipeline.status(workspace=toys / "w", stages=["read", "scale", "count"])
+    assert [stage.state for stage in found] == ["cached", "cached", "missing"]
+
+
+def test_unknown_workspace_is_refused(toys: Path) -> None:
+    with pytest.raises(pipeline.RequestError, match="is not a workspace"):
+        pipeline.status(workspace=toys / "nowhere")
+    with pytest.raises(pipeline.RequestError, match="nothing in it was deleted"):
+        pipeline.clean(toys / "images")
+    assert (toys / "images" / "0.txt").exists()
+
+
+def test_clean_spares_what_is_in_use(run: Any, toys: Path) -> None:
+    for factor in (3, 4, 5):
+        run(f"scale.factor={factor}")
+    removed, freed = pipeline.clean(toys / "w", keep=1)
+    assert len([name for name in removed if name.startswith("scale/")]) == 1
+    assert freed > 0
+    assert set(run("scale.factor=5").values()) == {"cached"}
+    assert set(run("scale.factor=4").values()) == {"cached"}
+    assert run("scale.factor=3")["scale"] == "ran"
+    pipeline.clean(toys / "w")
+    assert set(run("scale.factor=3").values()) == {"cached"}
+    assert run("scale.factor=4")["scale"] == "ran"
