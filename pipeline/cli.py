@@ -266,3 +266,7 @@ def _unexpected(error: Exception, debug: bool) -> int:
     if debug:
         raise error
     return _fail(PipelineError(text), 1, debug)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""`doctor` finds what is broken and says how to mend it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from pipeline import checkup
+
+
+def by_name(findings: list[checkup.Finding]) -> dict[str, checkup.Finding]:
+    return {finding.name: finding for finding in findings}
+
+
+def test_missing_library_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkup, "LIBRARIES", {"numpy": "numpy", "no-such-thing": "no_such_thing"})
+    found = by_name(list(checkup._libraries()))
+    assert found["numpy"].level == "ok"
+    assert found["no-such-thing"].level == "problem"
+    assert "pip install" in found["no-such-thing"].mend
+
+
+def test_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    found = by_name(list(checkup._system_libraries()))
+    assert found["libusb-1.0-0"].level == "problem"
+    assert "apt-get install libusb-1.0-0" in found["libusb-1.0-0"].mend
+
+
+def test_two_cv2_wheels_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    wheels = [
+        SimpleNamespace(metadata={"Name": name})
+        for name in ("opencv-python", "opencv-contrib-python-headless", "numpy")
+    ]
+    monkeypatch.setattr(checkup, "distributions", lambda: wheels)
+    (finding,) = checkup._cv2_wheels()
+    assert finding.level == "problem"
+    assert "opencv-python" in finding.detail and "pip uninstall" in finding.mend
+    monkeypatch.setattr(checkup, "distributions", lambda: wheels[1:])
+    assert not list(checkup._cv2_wheels())
+
+
+def test_no_stages_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.stage._entry_points", dict)
+    assert any(finding.level == "problem" for finding in checkup._stages())
+
+
+def test_every_stage_of_the_project_can_be_imported() -> None:
+    assert [finding.level for finding in checkup._stages()] == ["ok"]
