@@ -16,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import RequestError, nearest
-from pipeline.stage import StageConfig, get_stage, stage_names
+from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
 
 DEFAULT_PRESET = "dentalsplat"
 
@@ -79,12 +79,13 @@ def load_config(
             )
     run = _validate(RunConfig, {k: v for k, v in tree.items() if k in run_fields}, "")
     for name in run.stages:
-        get_stage(name)
+        if name not in sections:
+            get_stage(name)  # raises, naming the nearest
     return Config(
         run=run,
         sections={
-            name: _validate(get_stage(name).Config, tree.get(name) or {}, name)
-            for name in sorted(sections)
+            name: _validate(stage.Config, tree.get(name) or {}, name)
+            for name, stage in usable_stages().items()
         },
     )
 

@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.config import Config, result_fields
 from pipeline.errors import RequestError, nearest
 from pipeline.files import canonical_json, sha256_file, sha256_text
-from pipeline.stage import Stage, get_stage, stage_names
+from pipeline.stage import Stage, get_stage, usable_stages
 from pipeline.store import Result, Store
 
 
@@ -99,7 +99,8 @@ def resolve_chain(
                 f"{nearest(from_stage, names)}"
             )
         names = names[names.index(from_stage) :]
-    readers = tuple(name for name in order if get_stage(name).uses_sources)
+    usable = usable_stages()
+    readers = tuple(name for name in order if name in usable and usable[name].uses_sources)
     implicit = tuple(name for name in readers if name not in names)
     if images_named:
         names = (*implicit, *names)
@@ -133,7 +134,7 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
 
 
 def _nobody_provides(name: str, kind: str) -> str:
-    makers = [n for n in stage_names() if kind in get_stage(n).provides and n != name]
+    makers = [n for n, stage in usable_stages().items() if kind in stage.provides and n != name]
     from_where = f" ({' or '.join(makers)} would make them)" if makers else ""
     if kind == "views":
         return f"The stage '{name}' needs photographs: give a folder, files, a glob or a video."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -181,6 +182,15 @@ def _entry_points() -> dict[str, EntryPoint]:
 def stage_names() -> list[str]:
     """Names of the registered stages (entry points of the group `dentalsplat.stages`)."""
     return sorted(_entry_points())
+
+
+def usable_stages() -> dict[str, Stage]:
+    """The registered stages that can be imported; a broken one only harms who asks for it."""
+    found = {}
+    for name in stage_names():
+        with contextlib.suppress(RequestError):
+            found[name] = get_stage(name)
+    return found
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 from rich.console import Console
@@ -46,6 +47,8 @@ def print_summary(summary: RunSummary) -> None:
         for warning in stage.warnings:
             console.print(f"[yellow]Note[/] ({stage.name}): ", end="")
             console.print(warning, markup=False)
+    if text := headline(summary):
+        console.print(f"\n{text}")
     if summary.results:
         console.print(f"\nResults: {summary.results}/", soft_wrap=True)
         viewer = summary.results / "viewer.html"
@@ -53,6 +56,27 @@ def print_summary(summary: RunSummary) -> None:
             console.print(f"Look at it: open {viewer} in a browser.", soft_wrap=True)
     else:
         console.print(f"\nResults: {summary.workspace}/", soft_wrap=True)
+
+
+#: Figures that everybody asks for, by the names under which stages report them.
+HEADLINE = (
+    "{views_registered} of {views_total} views registered",
+    "{points_before:,} points, {points_after_pruning:,} after SAP",
+    "{gaussians:,} Gaussians",
+    "PSNR {psnr:.2f} dB on the input views",
+)
+
+
+def headline(summary: RunSummary) -> str:
+    """One sentence with those figures that the stages of this run gave."""
+    figures: dict[str, Any] = {}
+    for stage in summary.stages:
+        figures |= stage.figures["summary"]
+    parts = []
+    for text in HEADLINE:
+        with contextlib.suppress(KeyError):
+            parts.append(text.format_map(figures))
+    return "; ".join(parts)
 
 
 def print_dry_run(summary: RunSummary) -> None:

@@ -1,0 +1,22 @@
+"""The Gaussian model and the differentiable rasterizer on the CPU.
+
+`render` draws finished Gaussians; `rasterizer.rasterize` is the differentiable function; `loss` and
+`adam` are the other kernels of the fit. Imports nothing until a name is used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stages.splatting.rendering import RenderedView, render
+
+__all__ = ["RenderedView", "render"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        from stages.splatting import rendering
+
+        return getattr(rendering, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,278 @@
+"""Fuse the depth maps of all views into one coloured cloud, each piece of surface once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+from scipy import ndimage
+
+from pipeline.artifacts.cameras import Camera
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """Settings of `fuse`.
+
+    Attributes:
+        fill_confidence: depths of no more confidence are fill: used where nothing better is.
+        fill_stride: every so many pixels in x and y, one fill pixel is considered.
+        relative_depth: relative difference of depth within which two views see the same surface.
+        front: a depth this share in front of what another view sees there is refuted.
+        min_agreeing: other views that must agree; 0: nothing but not being refuted.
+        merge: drop a pixel that a more confident view explains (else every view's pixel stays).
+    """
+
+    fill_confidence: float = 1.25
+    fill_stride: int = 3
+    relative_depth: float = 0.01
+    front: float = 0.02
+    min_agreeing: int = 0
+    merge: bool = True
+
+
+@dataclass(frozen=True)
+class FusedCloud:
+    """A coloured cloud.
+
+    Attributes:
+        positions: [N, 3] float32 world.
+        colors: [N, 3] float32 sRGB.
+        normals: [N, 3] float32, unit, facing the view that the point comes from.
+        confidence: [N] float32 >= 1.
+        fill: how many of the points are fill.
+        residual: median relative depth difference between agreeing views; nan if none agree.
+    """
+
+    positions: Array
+    colors: Array
+    normals: Array
+    confidence: Array
+    fill: int
+    residual: float
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _fuse_view(  # type: ignore[no-untyped-def]
+    index, depths, confidences, images, cameras, fill_confidence, relative, front,
+    min_agreeing, merge, keep, depth_out, color_out, residual_out,
+):  # fmt: skip
+    here = cameras[index]
+    views = depths.shape[0]
+    for y in prange(keep.shape[0]):
+        colors = np.empty((views, 3), np.float32)
+        lumas = np.empty(views, np.float32)
+        weights = np.empty(views, np.float32)
+        for x in range(keep.shape[1]):
+            z = np.float64(depths[index, y, x])
+            own = confidences[index, y, x]
+            if z <= 0 or own <= np.float32(1):
+                continue
+            is_fill = own <= fill_confidence
+            a = (x + 0.5 - here[2]) / here[0] * z - here[15]
+            b = (y + 0.5 - here[3]) / here[1] * z - here[16]
+            c = z - here[17]
+            X = here[6] * a + here[9] * b + here[12] * c
+            Y = here[7] * a + here[10] * b + here[13] * c
+            Z = here[8] * a + here[11] * b + here[14] * c
+            weights[0] = own - np.float32(1)
+            for k in range(3):
+                colors[0, k] = images[index, y, x, k]
+            lumas[0] = colors[0].sum()
+            mass = np.float64(own) - 1
+            mean = z * mass
+            residual = 0.0
+            agree = 0
+            refuted = 0
+            explained = False
+            for v in range(views):
+                if v == index:
+                    continue
+                there = cameras[v]
+                zv = there[12] * X + there[13] * Y + there[14] * Z + there[17]
+                if zv <= 1e-9:
+                    continue
+                p = there[6] * X + there[7] * Y + there[8] * Z + there[15]
+                q = there[9] * X + there[10] * Y + there[11] * Z + there[16]
+                j = np.int64(np.floor(there[0] * p / zv + there[2]))
+                i = np.int64(np.floor(there[1] * q / zv + there[3]))
+                if i < 0 or j < 0 or i >= there[5] or j >= there[4]:
+                    continue
+                seen = np.float64(depths[v, i, j])
+                other = confidences[v, i, j]
+                if seen <= 0 or other <= np.float32(1):
+                    continue
+                other_fill = other <= fill_confidence
+                if other_fill and not is_fill:
+                    continue  # a guess says nothing about a measurement
+                if zv < seen * (1 - front) and not other_fill:
+                    refuted += 1
+                    continue
+                # Fill is smooth and rough at once: what lies near it is it.
+                within = 4 * relative if is_fill else relative
+                if abs(seen - zv) > within * zv:
+                    continue
+                if other > own or (other == own and v < index) or (is_fill and not other_fill):
+                    explained = True
+                agree += 1
+                residual += abs(seen - zv) / zv
+                weight = np.float64(other) - 1
+                mean += weight * (z + (seen - zv) * z / zv)
+                mass += weight
+                weights[agree] = other - np.float32(1)
+                for k in range(3):
+                    colors[agree, k] = images[v, i, j, k]
+                lumas[agree] = colors[agree].sum()
+            if refuted > agree or (is_fill and refuted > 0):
+                continue
+            if explained and merge:
+                continue
+            if not is_fill and agree < min_agreeing:
+                continue
+            keep[y, x] = 2 if is_fill else 1
+            depth_out[y, x] = np.float32(z if is_fill else mean / mass)
+            residual_out[y, x] = np.float32(residual / agree if agree > 0 else -1)
+            # The weighted median by luma, the darker one of two: highlights move with the camera
+            # and are brighter than the surface, so they lose against any other view.
+            count = agree + 1
+            order = np.argsort(lumas[:count])
+            half = np.float32(0.5) * weights[:count].sum()
+            running = np.float32(0)
+            chosen = order[0]
+            for k in range(count):
+                running += weights[order[k]]
+                if running >= half or k == (count - 1) // 2:
+                    chosen = order[k]
+                    break
+            for k in range(3):
+                color_out[y, x, k] = colors[chosen, k]
+
+
+def _camera_rows(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
+    """[V, 18]: fx, fy, cx, cy, width, height, rotation row-major, translation."""
+    return np.array(
+        [
+            [c.fx, c.fy, c.cx, c.cy, c.width, c.height, *c.rotation.ravel(), *c.translation]
+            for c in cameras
+        ],
+        np.float64,
+    )
+
+
+def depth_normals(depth: Array, confidence: Array, camera: Camera, sigma_px: float = 2.0) -> Array:
+    """Unit normals [H, W, 3] float32 in the world, facing the camera, from a depth map [H, W].
+
+    On a plane the inverse depth is linear in the pixel coordinates, and its gradient is the
+    normal; it is taken from inverse depths smoothed by a Gaussian, weighted by confidence - 1.
+    """
+    known = depth > 0
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float64)
+    weight = np.where(known, np.maximum(confidence - 1, 1e-4), 0).astype(np.float64)
+    mass = ndimage.gaussian_filter(weight, sigma_px, mode="nearest")
+    smooth = ndimage.gaussian_filter(weight * inverse, sigma_px, mode="nearest")
+    smooth = np.where(mass > 1e-12, smooth / np.maximum(mass, 1e-12), inverse)
+    gy, gx = np.gradient(smooth)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    a, b = gx * camera.fx, gy * camera.fy
+    normal = -np.stack([a, b, smooth - a * x - b * y], -1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    ray = np.stack([x, y, np.ones_like(x)], -1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    # Steeper than grazing is a depth jump, not a surface: turn it just towards the camera.
+    normal -= np.maximum(0.1 + (normal * ray).sum(-1), 0)[..., None] * ray
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    return (normal @ camera.rotation).astype(np.float32)
+
+
+def fuse(
+    depths: Sequence[Array],
+    confidences: Sequence[Array],
+    images: Sequence[Array],
+    cameras: Sequence[Camera],
+    options: FusionOptions,
+    threads: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> FusedCloud:
+    """Fuse depth maps: confident surfaces once, fill where nothing better is, colours without
+    highlights.
+
+    A depth stays unless more views see through it than agree with it. Where views agree, the most
+    confident pixel stays with the depth that all of them say (weighted by confidence - 1) and the
+    weighted median colour; the others are dropped, as in InstantSplat's co-visibility pruning. Fill
+    is dropped wherever a confident surface explains or refutes it.
+
+    Args:
+        depths: V arrays [H, W] float32 z-depth, 0 where there is none; sizes may differ.
+        confidences: V arrays [H, W] float32 >= 1; 1 means nothing known.
+        images: V arrays [H, W, 3] float32 sRGB.
+        cameras: V cameras.
+        options: see `FusionOptions`.
+        threads: does not change the result.
+        progress: called with (views done, views).
+
+    Returns:
+        The cloud, in the order of views and pixels.
+    """
+    count = len(cameras)
+    height = max(depth.shape[0] for depth in depths)
+    width = max(depth.shape[1] for depth in depths)
+    depth_stack = np.zeros((count, height, width), np.float32)
+    confidence_stack = np.ones((count, height, width), np.float32)
+    image_stack = np.zeros((count, height, width, 3), np.float32)
+    for v in range(count):
+        h, w = depths[v].shape
+        depth_stack[v, :h, :w] = depths[v]
+        confidence_stack[v, :h, :w] = confidences[v]
+        image_stack[v, :h, :w] = images[v]
+    table = _camera_rows(cameras)
+    before = numba.get_num_threads()
+    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    numba.set_num_threads(max(1, min(threads, available)))
+    parts: list[tuple[Array, ...]] = []
+    residuals = []
+    fill = 0
+    try:
+        for v, camera in enumerate(cameras):
+            shape = depths[v].shape
+            keep = np.zeros(shape, np.uint8)
+            depth = np.zeros(shape, np.float32)
+            color = np.zeros((*shape, 3), np.float32)
+            residual = np.full(shape, -1, np.float32)
+            _fuse_view(
+                v, depth_stack, confidence_stack, image_stack, table,
+                np.float32(options.fill_confidence), float(options.relative_depth),
+                float(options.front), int(options.min_agreeing), bool(options.merge),
+                keep, depth, color, residual,
+            )  # fmt: skip
+            thinned = np.zeros(shape, bool)
+            thinned[options.fill_stride // 2 :: options.fill_stride,
+                    options.fill_stride // 2 :: options.fill_stride] = True  # fmt: skip
+            kept = (keep == 1) | ((keep == 2) & thinned)
+            fill += int(((keep == 2) & thinned).sum())
+            residuals.append(residual[(keep == 1) & (residual >= 0)])
+            normals = depth_normals(depths[v], confidences[v], camera)
+            parts.append(
+                (
+                    camera.unproject(depth)[kept].astype(np.float32),
+                    color[kept],
+                    normals[kept],
+                    confidences[v][kept],
+                )
+            )
+            progress(v + 1, count)
+    finally:
+        numba.set_num_threads(before)
+    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+    agreed = np.concatenate(residuals)
+    residual_median = float(np.median(agreed)) if len(agreed) else float("nan")
+    return FusedCloud(*joined, fill=fill, residual=residual_median)

@@ -1,0 +1,50 @@
+"""The frame that a reconstruction without known cameras is given in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+
+Array = npt.NDArray[np.float64]
+
+
+def normalising_similarity(
+    cameras: Sequence[Camera], points: npt.NDArray[np.floating]
+) -> tuple[float, Array, Array]:
+    """Similarity to a world with y down, z ahead, centre at the points' median, median depth 1.
+
+    Args:
+        cameras: at least one.
+        points: [N, 3] world points, at least one.
+
+    Returns:
+        (scale, rotation [3, 3], translation [3]) of new = s R old + t.
+    """
+    down = np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
+    if np.linalg.norm(down) < 1e-3:
+        down = cameras[0].rotation[1]
+    down = down / np.linalg.norm(down)
+    ahead = ahead - (ahead @ down) * down
+    if np.linalg.norm(ahead) < 1e-3:
+        ahead = cameras[0].rotation[2] - (cameras[0].rotation[2] @ down) * down
+    ahead = ahead / np.linalg.norm(ahead)
+    rotation = np.stack([np.cross(down, ahead), down, ahead])
+    centre = np.median(np.asarray(points, np.float64), axis=0)
+    depth = np.median([camera.project(centre[None])[1][0] for camera in cameras])
+    scale = 1.0 / max(float(abs(depth)), 1e-12)
+    return scale, rotation, -scale * rotation @ centre
+
+
+def move_camera(camera: Camera, motion: tuple[float, Array, Array]) -> Camera:
+    """The camera in the world that (scale, rotation, translation) leads to, depths times scale."""
+    scale, rotation, shift = motion
+    pose = np.eye(4)
+    pose[:3, :3] = camera.rotation @ rotation.T
+    pose[:3, 3] = scale * camera.translation - pose[:3, :3] @ shift
+    return replace(camera, cam_from_world=pose)

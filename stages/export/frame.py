@@ -1,0 +1,117 @@
+"""Carrying a scene over to another frame by a similarity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.points import Points
+
+Array = npt.NDArray[np.float64]
+
+
+def split_similarity(similarity: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation [3, 3] and translation [3] of a similarity [4, 4].
+
+    Raises:
+        ValueError: it is not a similarity (shear, reflection, uneven or zero scale).
+    """
+    matrix = np.asarray(similarity, np.float64)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if not scale > 0 or not np.isfinite(matrix).all():
+        raise ValueError("not a similarity: it mirrors the scene or flattens it")
+    rotation = matrix[:3, :3] / scale
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
+        raise ValueError("not a similarity: it stretches the scene unevenly")
+    return scale, rotation, matrix[:3, 3]
+
+
+def harmonics(directions: npt.NDArray[np.floating]) -> Array:
+    """The 16 real spherical harmonics of 3DGS at unit directions [M, 3] -> [M, 16]."""
+    x, y, z = np.asarray(directions, np.float64).T
+    xx, yy, zz = x * x, y * y, z * z
+    return np.stack(
+        [
+            np.full_like(x, 0.28209479177387814),
+            -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+            1.0925484305920792 * x * y, -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
+            -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy),
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def harmonics_rotation(rotation: Array) -> Array:
+    """[16, 16] matrix that turns coefficients so that the colours turn with the scene.
+
+    Each degree only mixes with itself; its block is found by solving for the coefficients at well
+    spread directions, which is exact because the rotated functions lie in the same space.
+    """
+    golden = np.pi * (3 - np.sqrt(5))
+    step = np.arange(64)
+    height = 1 - (2 * step + 1) / 64
+    ring = np.sqrt(1 - height**2)
+    directions = np.stack([ring * np.cos(golden * step), ring * np.sin(golden * step), height], 1)
+    here, before = harmonics(directions), harmonics(directions @ rotation)  # R^T d
+    matrix = np.zeros((16, 16))
+    for degree in range(4):
+        block = slice(degree**2, (degree + 1) ** 2)
+        matrix[block, block] = np.linalg.lstsq(here[:, block], before[:, block], rcond=None)[0]
+    return matrix
+
+
+def move_gaussians(gaussians: Gaussians, similarity: Array) -> Gaussians:
+    """The Gaussians in the frame that `similarity` [4, 4] leads to."""
+    scale, rotation, translation = split_similarity(similarity)
+    if np.array_equal(similarity, np.eye(4)):
+        return gaussians
+    quats = Rotation.from_quat(gaussians.quats_wxyz[:, [1, 2, 3, 0]].astype(np.float64))
+    turned = (Rotation.from_matrix(rotation) * quats).as_quat()[:, [3, 0, 1, 2]]
+    means = scale * gaussians.means.astype(np.float64) @ rotation.T + translation
+    sh = np.einsum("ij,njc->nic", harmonics_rotation(rotation), gaussians.sh.astype(np.float64))
+    for degree in range(4):  # unused degrees stay exactly zero
+        block = slice(degree**2, (degree + 1) ** 2)
+        if not np.any(gaussians.sh[:, block]):
+            sh[:, block] = 0
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats_wxyz=turned.astype(np.float32),
+        log_scales=(gaussians.log_scales + np.float32(np.log(scale))).astype(np.float32),
+        logit_opacities=gaussians.logit_opacities,
+        sh=sh.astype(np.float32),
+    )
+
+
+def move_cameras(cameras: Iterable[Camera], similarity: Array) -> tuple[Camera, ...]:
+    """The cameras in the frame that `similarity` [4, 4] leads to; their pictures stay the same."""
+    scale, rotation, translation = split_similarity(similarity)
+    moved = []
+    for camera in cameras:
+        pose = np.eye(4)
+        pose[:3, :3] = camera.rotation @ rotation.T
+        pose[:3, 3] = scale * camera.translation - pose[:3, :3] @ translation
+        moved.append(replace(camera, cam_from_world=pose))
+    return tuple(moved)
+
+
+def move_points(points: Points, similarity: Array) -> Points:
+    """The points in the frame that `similarity` [4, 4] leads to."""
+    scale, rotation, translation = split_similarity(similarity)
+    return replace(
+        points,
+        positions=(scale * points.positions @ rotation.T + translation).astype(np.float32),
+        normals=(points.normals @ rotation.T).astype(np.float32),
+        scale=(points.scale * scale).astype(np.float32),
+    )

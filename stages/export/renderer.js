@@ -1,0 +1,186 @@
+// Draws Gaussians with WebGL2, with the conventions of stages/splatting.
+
+/**
+ * @typedef {object} Pose A pinhole camera, OpenCV axes (x right, y down, z forward).
+ * @property {number[]} rotation 9 numbers, row-major, of cam_from_world
+ * @property {number[]} translation 3 numbers
+ * @property {number} fx
+ * @property {number} fy
+ * @property {number} cx
+ * @property {number} cy
+ * @property {number} width image that the intrinsics refer to, in pixels
+ * @property {number} height
+ */
+
+class SplatRenderer {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{count: number, sh_degree: number, texels: number, per_row: number,
+   *   rasterizer: object}} format of the packed splats
+   * @param {Uint32Array} packed
+   * @param {Record<string, string>} shaders GLSL by file name
+   */
+  constructor(canvas, format, packed, shaders) {
+    this.canvas = canvas;
+    this.format = format;
+    this.packed = packed;
+    this.shaders = shaders;
+    this.order = null;
+    this.#build();
+  }
+
+  #build() {
+    const gl = this.canvas.getContext("webgl2", {
+      alpha: false, antialias: false, depth: false, powerPreference: "high-performance",
+    });
+    if (!gl) throw new Error("This browser or device offers no WebGL2.");
+    this.gl = gl;
+    // Half floats keep faint layers that 8 bits would round away.
+    this.halfFloat = Boolean(gl.getExtension("EXT_color_buffer_float")
+      ?? gl.getExtension("EXT_color_buffer_half_float"));
+    const { texels, per_row: perRow, sh_degree: degree, rasterizer: r } = this.format;
+    const defines = {
+      TEXELS: texels, PER_ROW: perRow, SH_DEGREE: degree, LOW_PASS: r.low_pass.toFixed(6),
+      ALPHA_MIN: r.alpha_min.toFixed(9), ALPHA_MAX: r.alpha_max.toFixed(6),
+    };
+    this.splatProgram = this.#program("splat.vert.glsl", "splat.frag.glsl", defines);
+    this.screenProgram = this.#program("screen.vert.glsl", "screen.frag.glsl", {});
+    this.#upload();
+    this.orderBuffer = gl.createBuffer();
+    this.vertices = gl.createVertexArray();
+    gl.bindVertexArray(this.vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    const slot = gl.getAttribLocation(this.splatProgram.handle, "a_splat");
+    gl.enableVertexAttribArray(slot);
+    gl.vertexAttribIPointer(slot, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(slot, 1);
+    gl.bindVertexArray(null);
+    this.noVertices = gl.createVertexArray();
+    this.target = null;
+    if (this.order) this.setOrder(this.order);
+  }
+
+  /** After a lost context: everything on the graphics card has to be made again. */
+  restore() {
+    this.#build();
+  }
+
+  #program(vertexName, fragmentName, defines) {
+    const gl = this.gl;
+    const head = Object.entries(defines).map(([key, value]) => `#define ${key} ${value}\n`).join("");
+    const handle = gl.createProgram();
+    for (const [kind, name] of [[gl.VERTEX_SHADER, vertexName], [gl.FRAGMENT_SHADER, fragmentName]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, this.shaders[name].replace("\n", `\n${head}`));
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+        throw new Error(`The graphics driver refused ${name}: ${gl.getShaderInfoLog(shader)}`);
+      }
+      gl.attachShader(handle, shader);
+    }
+    gl.linkProgram(handle);
+    if (!gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) {
+      throw new Error(`The graphics driver refused the program: ${gl.getProgramInfoLog(handle)}`);
+    }
+    const uniforms = {};
+    const number = gl.getProgramParameter(handle, gl.ACTIVE_UNIFORMS) ?? 0;
+    for (let k = 0; k < number; k++) {
+      const { name } = gl.getActiveUniform(handle, k);
+      uniforms[name] = gl.getUniformLocation(handle, name);
+    }
+    return { handle, uniforms };
+  }
+
+  #upload() {
+    const gl = this.gl;
+    const { count, texels, per_row: perRow } = this.format;
+    const width = perRow * texels;
+    const height = Math.max(1, Math.ceil(count / perRow));
+    if (Math.max(width, height) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+      throw new Error(`The scene is too large for this device (${count} Gaussians).`);
+    }
+    const padded = new Uint32Array(width * height * 4);
+    padded.set(this.packed);
+    this.splats = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, this.splats);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, width, height, 0, gl.RGBA_INTEGER,
+      gl.UNSIGNED_INT, padded);
+  }
+
+  #resizeTarget(width, height) {
+    if (this.target?.width === width && this.target?.height === height) return;
+    const gl = this.gl;
+    if (this.target) {
+      gl.deleteTexture(this.target.texture);
+      gl.deleteFramebuffer(this.target.framebuffer);
+    }
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.halfFloat ? gl.RGBA16F : gl.RGBA8, width, height);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    const framebuffer = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && this.halfFloat
+        && !gl.isContextLost()) {
+      this.halfFloat = false;
+      this.target = { texture, framebuffer, width: 0, height: 0 };
+      this.#resizeTarget(width, height);
+      return;
+    }
+    this.target = { texture, framebuffer, width, height };
+  }
+
+  /** @param {Uint32Array} order splat indices, farthest first */
+  setOrder(order) {
+    const gl = this.gl;
+    this.order = order;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+  }
+
+  /**
+   * Draw into the canvas, whose size in pixels is that of the pose.
+   * @param {Pose} pose @param {number[]} background rgb in 0..1
+   */
+  draw(pose, background) {
+    const gl = this.gl;
+    if (gl.isContextLost() || !this.order) return;
+    const { width, height, fx, fy, cx, cy, rotation: R, translation: t } = pose;
+    this.#resizeTarget(width, height);
+    gl.viewport(0, 0, width, height);
+
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.useProgram(this.splatProgram.handle);
+    gl.bindTexture(gl.TEXTURE_2D, this.splats);
+    gl.bindVertexArray(this.vertices);
+    const u = this.splatProgram.uniforms;
+    const { near, slope_margin: margin } = this.format.rasterizer;
+    gl.uniformMatrix3fv(u.u_rotation, true, R);
+    gl.uniform3fv(u.u_translation, t);
+    gl.uniform3fv(u.u_centre, centreOf(R, t));
+    gl.uniform2f(u.u_focal, fx, fy);
+    gl.uniform2f(u.u_principal, cx, cy);
+    gl.uniform2f(u.u_size, width, height);
+    gl.uniform2f(u.u_slope_min, (-margin * width - cx) / fx, (-margin * height - cy) / fy);
+    gl.uniform2f(u.u_slope_max,
+      ((1 + margin) * width - cx) / fx, ((1 + margin) * height - cy) / fy);
+    gl.uniform1f(u.u_near, near);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.order.length);
+
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.BLEND);
+    gl.useProgram(this.screenProgram.handle);
+    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
+    gl.bindVertexArray(this.noVertices);
+    gl.uniform3fv(this.screenProgram.uniforms.u_background, background);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}

@@ -1,0 +1,260 @@
+"""A triangle mesh from depth maps (TSDF) or from points (screened Poisson)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from pipeline.artifacts.cameras import Camera
+
+Array = npt.NDArray[np.float64]
+
+#: Depth maps are trusted where at least this much of the light is accounted for ...
+LEAST_ALPHA = 0.6
+#: ... and away from steps: depth changes by less than this share across 3 x 3 pixels.
+STEEPEST_STEP = 0.03
+#: Poisson takes minutes beyond this depth.
+DEEPEST_OCTREE = 10
+#: Voxels along the edge of a block of the distance field.
+BLOCK = 8
+#: Voxels that fewer depth maps than this have seen don't count.
+LEAST_WEIGHT = 1.5
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A coloured triangle mesh.
+
+    Attributes:
+        vertices: [V, 3] float64, world.
+        faces: [F, 3] int32, counter-clockwise as seen from outside.
+        colors: [V, 3] float64 sRGB in 0..1.
+    """
+
+    vertices: Array
+    faces: npt.NDArray[np.int32]
+    colors: Array
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+
+def trusted_depth(
+    depth: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating], farthest: float
+) -> npt.NDArray[np.float32]:
+    """A depth map [H, W] with 0 where it is transparent, at a step, or too far."""
+    clean = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    step = cv2.dilate(clean, kernel) - cv2.erode(clean, kernel)
+    good = (alpha >= LEAST_ALPHA) & (clean < farthest) & (step < STEEPEST_STEP * clean)
+    return np.where(good, clean, np.float32(0))
+
+
+def fuse_depths(
+    frames: Iterable[tuple[Camera, npt.NDArray[np.uint8], npt.NDArray[np.float32]]],
+    voxel: float,
+    truncation: float,
+) -> Mesh:
+    """Fuse depth maps into a truncated signed distance field and extract its surface.
+
+    Curless and Levoy 1996, with Open3D's hashed volume (whose voxels are independent of each
+    other, so that the number of threads doesn't matter).
+
+    Args:
+        frames: camera, RGB image [H, W, 3], depth map [H, W] (z; 0: unknown).
+        voxel: edge length, world units.
+        truncation: distance at which the field is cut, world units.
+    """
+    import open3d
+
+    core = open3d.core
+    volume = open3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(core.float32, core.float32, core.float32),
+        attr_channels=[core.SizeVector([number]) for number in (1, 1, 3)],
+        voxel_size=voxel,
+        block_resolution=BLOCK,
+        block_count=20_000,
+        device=core.Device("CPU:0"),
+    )
+    for camera, image, depth in frames:
+        # Open3D's pixel centres lie at whole numbers.
+        lens = core.Tensor.from_numpy(camera.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        pose = core.Tensor.from_numpy(np.ascontiguousarray(camera.cam_from_world))
+        farthest = 1.0 + float(depth.max())
+        depth_image = open3d.t.geometry.Image(core.Tensor.from_numpy(np.ascontiguousarray(depth)))
+        color_image = open3d.t.geometry.Image(core.Tensor.from_numpy(image.astype(np.float32)))
+        blocks = volume.compute_unique_block_coordinates(
+            depth_image, lens, pose, 1.0, farthest, truncation / voxel
+        )
+        volume.integrate(
+            blocks, depth_image, color_image, lens, lens, pose, 1.0, farthest, truncation / voxel
+        )
+    surface = volume.extract_triangle_mesh(weight_threshold=LEAST_WEIGHT)
+    mesh = _from_open3d(surface.to_legacy())
+    return Mesh(mesh.vertices, mesh.faces, mesh.colors / 255.0)
+
+
+def poisson(
+    points: npt.NDArray[np.floating],
+    normals: npt.NDArray[np.floating],
+    colors: npt.NDArray[np.floating],
+    depth: int,
+) -> tuple[Mesh, Array]:
+    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), on one thread: it isn't
+    deterministic on more.
+
+    Args:
+        points, normals, colors: [N, 3] each.
+        depth: of the octree.
+
+    Returns:
+        The (closed) mesh, and for every vertex the log2 density of points around it.
+    """
+    import open3d
+
+    cloud = open3d.geometry.PointCloud()
+    cloud.points = open3d.utility.Vector3dVector(np.asarray(points, np.float64))
+    cloud.normals = open3d.utility.Vector3dVector(np.asarray(normals, np.float64))
+    cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors, np.float64))
+    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=depth, n_threads=1
+    )
+    return _from_open3d(mesh), np.asarray(density)
+
+
+def smoothed(mesh: Mesh, cell: float) -> Mesh:
+    """Refit a mesh by screened Poisson through its own vertices, where the mesh is.
+
+    It irons out the steps between views and closes small holes.
+
+    Args:
+        mesh: what to smooth.
+        cell: size of the octree's cells, world units; details smaller than that go.
+    """
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell)), 3, DEEPEST_OCTREE))
+    surface, _ = poisson(mesh.vertices, vertex_normals(mesh), mesh.colors, depth)
+    return keep_near(surface, mesh.vertices, 2 * cell)
+
+
+def keep_near(mesh: Mesh, support: npt.NDArray[np.floating], reach: float) -> Mesh:
+    """The part of a mesh with a point of `support` [N, 3] within `reach` of each vertex."""
+    distance, _ = cKDTree(np.asarray(support, np.float64)).query(mesh.vertices)
+    return keep_vertices(mesh, distance <= reach)
+
+
+def spacing(points: npt.NDArray[np.floating]) -> float:
+    """Median distance of points [N, 3], N >= 2, to their nearest neighbours."""
+    cloud = np.asarray(points, np.float64)
+    distance, _ = cKDTree(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
+    return float(np.median(distance[:, 1]))
+
+
+def keep_vertices(mesh: Mesh, kept: npt.NDArray[np.bool_]) -> Mesh:
+    """The faces all of whose vertices are kept, without loose vertices."""
+    faces = mesh.faces[kept[mesh.faces].all(1)]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used) - 1
+    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.colors[used])
+
+
+def drop_small_parts(mesh: Mesh, least_share: float) -> Mesh:
+    """Drop connected parts with fewer than `least_share` of the largest part's faces."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if len(mesh) == 0:
+        return mesh
+    start, end = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
+    _, part = connected_components(graph, directed=False)
+    faces = np.bincount(part[mesh.faces[:, 0]], minlength=part.max() + 1)
+    return keep_vertices(mesh, faces[part] >= least_share * faces.max())
+
+
+def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
+    """Repair a mesh and simplify it to at most about `target_faces` (quadric edge collapse).
+
+    Removes duplicate and null faces and non-manifold edges and vertices, and closes holes of up to
+    `largest_hole` edges. Colours are taken over from the nearest original vertices.
+    """
+    import pymeshlab
+
+    work = pymeshlab.MeshSet(verbose=False)
+    work.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces))
+    work.meshing_remove_duplicate_vertices()
+    work.meshing_remove_duplicate_faces()
+    work.meshing_remove_null_faces()
+    _make_manifold(work)
+    work.meshing_close_holes(maxholesize=largest_hole, newfaceselected=False)
+    if work.current_mesh().face_number() > target_faces:
+        work.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=target_faces, preserveboundary=True, boundaryweight=2.0,
+            preservenormal=True, preservetopology=True, planarquadric=True, qualitythr=0.5,
+        )  # fmt: skip
+        _make_manifold(work)
+    work.meshing_remove_unreferenced_vertices()
+    result = work.current_mesh()
+    vertices = np.array(result.vertex_matrix(), np.float64)
+    faces = np.array(result.face_matrix(), np.int32)
+    return Mesh(vertices, faces, _transfer_colors(mesh, vertices))
+
+
+def _make_manifold(work):  # type: ignore[no-untyped-def]  # pymeshlab has no types
+    work.meshing_repair_non_manifold_edges()
+    work.meshing_repair_non_manifold_vertices()
+
+
+def _transfer_colors(source: Mesh, vertices: Array) -> Array:
+    """Colours of the nearest source vertices, weighted by closeness."""
+    number = min(4, len(source.vertices))
+    distance, index = cKDTree(source.vertices).query(vertices, number)
+    distance, index = distance.reshape(-1, number), index.reshape(-1, number)
+    weight = 1.0 / (distance + 0.1 * distance.mean() + 1e-12)
+    weight /= weight.sum(1, keepdims=True)
+    return np.asarray((weight[..., None] * source.colors[index]).sum(1))
+
+
+def face_normals(mesh: Mesh) -> Array:
+    """[F, 3], length twice the area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_normals(mesh: Mesh) -> Array:
+    """[V, 3] unit, area-weighted."""
+    flat = face_normals(mesh)
+    normals = np.stack(
+        [
+            sum(
+                np.bincount(mesh.faces[:, k], flat[:, axis], minlength=len(mesh.vertices))
+                for k in range(3)
+            )
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+
+def _from_open3d(mesh) -> Mesh:  # type: ignore[no-untyped-def]
+    """Arrays of an Open3D mesh, in an order that depends on the geometry alone."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    faces = np.asarray(mesh.triangles, np.int32)
+    order = np.lexsort(vertices.T)
+    number = np.empty(len(order), np.int64)
+    number[order] = np.arange(len(order))
+    faces = number[faces].astype(np.int32)
+    first = faces.argmin(1)  # turn each face so that its smallest index leads
+    faces = faces[np.arange(len(faces))[:, None], (first[:, None] + np.arange(3)) % 3]
+    faces = faces[np.lexsort(faces.T[::-1])]
+    colors = np.asarray(mesh.vertex_colors, np.float64).reshape(-1, 3)
+    return Mesh(vertices[order], faces, colors[order])

@@ -1,0 +1,188 @@
+"""The Gaussians that a fit starts from: a point cloud, thinned, with shading along its normals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from pipeline.artifacts.cameras import Camera
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+
+SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Attributes: positions, colors, normals [N, 3] (normals unit or 0), weight [N]; float64."""
+
+    positions: Array
+    colors: Array
+    normals: Array
+    weight: Array
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame in which a fit works: the scene's middle at 0, its median depth 1.
+
+    So rates, thresholds and the near plane mean the same for every scene, and float32 is enough.
+
+    Attributes:
+        centre: [3] in the world.
+        scale: world units per unit of the frame.
+    """
+
+    centre: Array
+    scale: float
+
+    def points(self, positions: npt.NDArray[np.floating]) -> Array:
+        """[N, 3] from the world."""
+        return (np.asarray(positions, np.float64) - self.centre) / self.scale
+
+    def pose(self, cam_from_world: Array) -> Array:
+        """[3, 4] cam_from_frame, with camera coordinates in units of the frame."""
+        rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
+        moved = (rotation @ self.centre + translation) / self.scale
+        return np.concatenate([rotation, moved[:, None]], 1)
+
+    def cam_from_world(self, pose: Array) -> Array:
+        """[4, 4], the inverse of `pose`."""
+        result = np.eye(4)
+        result[:3, :3] = pose[:, :3]
+        result[:3, 3] = self.scale * pose[:, 3] - pose[:, :3] @ self.centre
+        return result
+
+
+def choose_frame(positions: Array, cameras: Sequence[Camera]) -> Frame:
+    """Median position of the points; median of their depths in the cameras that see them."""
+    sample = positions[:: max(1, len(positions) // 20000)]
+    depths = []
+    for camera in cameras:
+        pixels, depth = camera.project(sample)
+        inside = (
+            (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        )
+        depths.append(depth[inside])
+    every = np.concatenate(depths)
+    scale = float(np.median(every)) if len(every) else 1.0
+    return Frame(np.median(positions, axis=0), scale if scale > 0 else 1.0)
+
+
+def thin(cloud: Cloud, target: int) -> Cloud:
+    """Average the points of a cloud in voxels, so that about `target` are left."""
+    if len(cloud) <= target:
+        return cloud
+    origin = cloud.positions.min(0)
+    # what lies far out must not decide the voxel size
+    low, high = np.quantile(cloud.positions, [0.02, 0.98], axis=0)
+    largest = float(np.linalg.norm(high - low)) or 1.0
+    smallest = largest * 1e-5
+
+    def cells(size: float) -> npt.NDArray[np.int64]:
+        index = np.floor((cloud.positions - origin) / size)
+        grid = np.clip(index, 0, 2**20).astype(np.int64)
+        return (grid[:, 0] << 42) | (grid[:, 1] << 21) | grid[:, 2]
+
+    for _ in range(24):
+        size = float(np.sqrt(smallest * largest))
+        count = len(np.unique(cells(size)))
+        if abs(count - target) <= 0.01 * target:
+            break
+        smallest, largest = (size, largest) if count > target else (smallest, size)
+    unique, cell = np.unique(cells(size), return_inverse=True)
+    mass = np.bincount(cell, cloud.weight, len(unique))
+
+    def mean(values: Array) -> Array:
+        sums = [np.bincount(cell, cloud.weight * column, len(unique)) for column in values.T]
+        return np.stack(sums, 1) / mass[:, None]
+
+    normals = mean(cloud.normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 0.2, normals / np.maximum(length, 1e-12), 0)
+    return Cloud(mean(cloud.positions), mean(cloud.colors), normals, mass)
+
+
+def neighbour_spacing(positions: Array) -> Array:
+    """[N] root mean square distance to the three nearest neighbours (3DGS's initialisation)."""
+    if len(positions) < 4:
+        return np.full(len(positions), 1e-2)
+    distance, _ = cKDTree(positions).query(positions, k=4)
+    return np.sqrt(np.maximum((distance[:, 1:] ** 2).mean(1), 1e-7 * np.median(distance) ** 2))
+
+
+def facing(positions: Array, normals: Array, cameras: Sequence[Camera]) -> Array:
+    """[N] mean cosine between normal and direction to the cameras that see the point, in .2 .. 1.
+
+    Weighted by the cosine itself: a camera that looks straight at a surface has most of its pixels.
+    """
+    total, mass = np.zeros(len(positions)), np.zeros(len(positions))
+    for camera in cameras:
+        pixels, depth = camera.project(positions)
+        inside = (
+            (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        )
+        towards = camera.centre - positions
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cosine = np.clip((towards * normals).sum(1), 0, 1) * inside
+        total += cosine**2
+        mass += cosine
+    return np.clip(total / np.maximum(mass, 1e-9), 0.2, 1)
+
+
+def initial_gaussians(
+    cloud: Cloud,
+    cameras: Sequence[Camera],
+    *,
+    opacity: float,
+    scale: float,
+    scale_max_px: float,
+    degree: int,
+    headlight: float,
+) -> Floats:
+    """Packed Gaussians [N, 11 + 3 K] from a cloud in the cameras' frame.
+
+    Args:
+        cloud: the points.
+        cameras: the placed views.
+        opacity: of every Gaussian.
+        scale: standard deviation as a multiple of the neighbours' spacing.
+        scale_max_px: its largest value, in pixels of the nearest camera.
+        degree: of the harmonics.
+        headlight: share k of the light that comes from the camera: colour = albedo (1 - k + k n.v),
+            which is exactly degree 1 in the direction of view (the flash moves with the camera).
+    """
+    count, terms = len(cloud), (degree + 1) ** 2
+    spacing = neighbour_spacing(cloud.positions)
+    pixel = np.full(count, np.inf)
+    for camera in cameras:
+        distance = np.linalg.norm(cloud.positions - camera.centre, axis=1)
+        pixel = np.minimum(pixel, distance / max(camera.fx, camera.fy))
+    sigma = np.clip(scale * spacing, 0.02 * pixel, scale_max_px * pixel)
+    packed = np.zeros((count, 11 + 3 * terms))
+    packed[:, 0:3] = cloud.positions
+    packed[:, 3] = 1
+    packed[:, 7:10] = np.log(sigma)[:, None]
+    packed[:, 10] = np.log(opacity / (1 - opacity))
+    constant = cloud.colors - 0.5
+    if degree > 0 and headlight > 0:
+        known = (np.abs(cloud.normals).sum(1) > 0)[:, None]
+        cosine = facing(cloud.positions, cloud.normals, cameras)[:, None]
+        directed = np.where(
+            known, headlight * cloud.colors / (1 - headlight + headlight * cosine), 0
+        )
+        constant = constant - directed * cosine
+        # basis of degree 1 along d = -v is (-y, z, -x) C1, and n.v = -n.d
+        packed[:, 14:17] = directed * cloud.normals[:, 1:2] / SH_C1
+        packed[:, 17:20] = -directed * cloud.normals[:, 2:3] / SH_C1
+        packed[:, 20:23] = directed * cloud.normals[:, 0:1] / SH_C1
+    packed[:, 11:14] = constant / SH_C0
+    return np.ascontiguousarray(packed, np.float32)

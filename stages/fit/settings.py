@@ -1,0 +1,94 @@
+"""Every constant of the fit, resolved: what the trainer works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+#: From this number of views on, a fit is limited by its capacity; below, by what the views say.
+MANY_VIEWS = 6
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """See `stage.FitConfig` for what each field means; here nothing is ``"auto"`` any more."""
+
+    iterations: int
+    initial_points: int
+    initial_opacity: float
+    initial_scale: float
+    initial_scale_max_px: float
+    sh_degree: int
+    sh_degree_interval: int
+    headlight: float
+    lambda_dssim: float
+    lambda_flow: float
+    lambda_depth: float
+    coarse_fraction: float
+    coarse_factor: int
+    position_lr_init: float
+    position_lr_final: float
+    feature_lr: float
+    feature_rest_lr: float
+    opacity_lr: float
+    scaling_lr: float
+    rotation_lr: float
+    optimize_poses: bool
+    pose_lr_init: float
+    pose_lr_final: float
+    pose_from_iter: int
+    exposure: bool
+    exposure_lr: float
+    densify: bool
+    absgrad: str
+    densify_from_iter: int
+    densify_until_iter: int
+    densification_interval: int
+    densify_grad_threshold: float
+    densify_abs_grad_threshold: float
+    percent_dense: float
+    max_gaussians: int
+    opacity_reset_interval: int
+    prune_opacity: float
+    final_prune_contribution: float
+    final_prune_near: float
+    near: float
+    background: tuple[float, float, float]
+    seed: int
+    checkpoint_every: int
+
+
+def automatic(views: int) -> dict[str, Any]:
+    """The values that ``"auto"`` stands for, from the number of placed views.
+
+    Few views overfit: few Gaussians, few iterations, no densification. From six views on a fit of
+    1,000 iterations is short of steps: higher rates and densification (both measured).
+    """
+    many = views >= MANY_VIEWS
+    rate = 6.0 if many else 2.0
+    iterations = 1000 if many else 400 + 200 * max(0, views - 3)
+    return {
+        "iterations": iterations,
+        "initial_points": 30000 if many else 15000,
+        "feature_lr": 2.5e-3 * rate,
+        "feature_rest_lr": 2.5e-3 / 20 * rate,
+        "scaling_lr": 5e-3 * rate,
+        "rotation_lr": 1e-3 * rate,
+        "densify": many,
+        "max_gaussians": 60000 if many else 15000,
+        "lambda_depth": 0.5,
+        "pose_lr_init": 1e-3,
+        "pose_lr_final": 1e-5,
+    }
+
+
+def resolve(values: dict[str, Any], views: int, seed: int) -> FitSettings:
+    """Replace every ``"auto"`` of a config's values by what it stands for with so many views."""
+    resolved = dict(values)
+    for name, value in automatic(views).items():
+        if resolved[name] == "auto":
+            resolved[name] = value
+    if resolved["densify_until_iter"] == "auto":
+        # what is split last still needs steps to settle
+        resolved["densify_until_iter"] = max(0, resolved["iterations"] - 100)
+    return FitSettings(**resolved, seed=seed)

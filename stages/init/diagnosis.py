@@ -1,0 +1,181 @@
+"""Saying what is wrong with the photographs, and what to do about it, to the one who took them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.init.classical import Attempt, Evidence
+from stages.init.geometry import Pair
+from stages.init.mapping import Solution
+
+#: Advice that helps in nearly all cases.
+HOW_TO_SHOOT = (
+    "Take photographs from different sides of the teeth, neighbouring ones turned by no more than "
+    "20 degrees against each other, all sharp and with the same zoom, and move the camera rather "
+    "than turning it on the spot."
+)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a reconstruction must keep to be believed.
+
+    Attributes:
+        min_views: least number of views.
+        min_coherence: least coherence of a pair that links views.
+        min_tri_angle: degrees, of the median point.
+        min_baseline: largest distance between two cameras over the median depth.
+        min_points: points that each view must observe.
+        max_error: root mean square reprojection error in pixels.
+        max_turn: degrees by which the cameras may contradict the pairs that link them.
+    """
+
+    min_views: int
+    min_coherence: float
+    max_error: float
+    min_tri_angle: float = 1.5
+    min_baseline: float = 0.02
+    min_points: int = 12
+    max_turn: float = 10.0
+
+
+def least_views(count: int, fraction: float) -> int:
+    """How many of `count` views must be placed: all of up to 3, else the fraction, at least 2."""
+    return count if count <= 3 else max(2, int(np.ceil(fraction * count)))
+
+
+def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
+    """The diagnosis of an attempt as one paragraph, or None if the reconstruction is good.
+
+    Args:
+        names: how the user knows the photographs.
+    """
+    if len(names) < 2:
+        return (
+            f"One photograph ({', '.join(names)}) can't give a 3D scene: at least two are needed, "
+            f"three or more are better. {HOW_TO_SHOOT}"
+        )
+    evidence, solution = attempt.evidence, attempt.solution
+    blank = [names[view] for view, count in enumerate(evidence.keypoints) if count < 50]
+    if blank and (solution is None or len(solution.poses) < limits.min_views):
+        return (
+            f"There is too little to recognise in {_listed(blank)} (fewer than 50 distinct "
+            "spots): the photograph is blurred, too dark, too bright, or its mask covers it. "
+            "Leave it out or take it again."
+        )
+    still = standing_still(evidence, len(names))
+    if still:
+        return still
+    if solution is None:
+        return (
+            "No two photographs could be placed against each other. "
+            f"{_weakest_link(evidence, names, set(), limits)} {_advice(attempt)}"
+        )
+    doubt = doubtful(solution, evidence, limits)
+    if doubt:
+        return f"{doubt} {HOW_TO_SHOOT}"
+    if len(solution.poses) < limits.min_views:
+        unplaced = [names[view] for view in range(len(names)) if view not in solution.poses]
+        return (
+            f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
+            f"{limits.min_views} are needed. Not placed: {_listed(unplaced)}. "
+            f"{_weakest_link(evidence, names, set(solution.poses), limits)} {_advice(attempt)}"
+        )
+    return None
+
+
+def standing_still(evidence: Evidence, count: int) -> str | None:
+    """The diagnosis if no pair of photographs shows any movement, else None."""
+    strong = [pair for pair, edge in evidence.edges.items() if edge.weight >= 25]
+    if not strong:
+        return None
+    linked = {view for pair in strong for view in pair}
+    if len(linked) == count and all(evidence.displacement[pair] < 1.5 for pair in strong):
+        return (
+            "The camera did not move between the photographs: they are the same, or nearly, "
+            f"so that there is no depth to see. {HOW_TO_SHOOT}"
+        )
+    return None
+
+
+def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | None:
+    """Why a reconstruction can't be believed, or None. Small residuals alone prove nothing."""
+    angle = float(np.median(solution.triangulation_angles())) if len(solution.points) else 0.0
+    centres = solution.centres()
+    baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
+    depth = _median_depth(solution)
+    if angle < limits.min_tri_angle or depth <= 0 or baseline < limits.min_baseline * depth:
+        return (
+            "The photographs were taken from nearly the same spot (the rays to the same points "
+            f"differ by {angle:.1f} degrees), which gives no depth."
+        )
+    if solution.error > limits.max_error:
+        return (
+            f"The photographs contradict each other: points miss their place by "
+            f"{solution.error:.1f} pixels. Something moved between them, or the zoom changed."
+        )
+    bare = [view for view in solution.poses if len(solution.points_of(view)) < limits.min_points]
+    linked = [evidence.edges[pair] for pair in solution.edges if pair in evidence.edges]
+    turned = [
+        _turn(solution, pair, evidence)
+        for pair in solution.edges
+        if pair in evidence.edges and {*pair} <= set(solution.poses)
+    ]
+    if bare or not linked or (turned and np.median(turned) > limits.max_turn):
+        return "The photographs could be placed only by coincidence: too few points agree on it."
+    return None
+
+
+def _turn(solution: Solution, pair: Pair, evidence: Evidence) -> float:
+    from stages.init.geometry import angle_between
+
+    i, j = pair
+    turn = solution.poses[j][:3, :3] @ solution.poses[i][:3, :3].T
+    return angle_between(turn, evidence.edges[pair].rotation)
+
+
+def _median_depth(solution: Solution) -> float:
+    depths = [solution.points @ pose[2, :3] + pose[2, 3] for pose in solution.poses.values()]
+    return float(np.median(np.concatenate(depths))) if depths else 0.0
+
+
+def _weakest_link(evidence: Evidence, names: list[str], placed: set[int], limits: Limits) -> str:
+    """Name the pair that should link the unplaced photographs with the rest, and what it lacks."""
+    missing = [pair for pair in evidence.matches if not placed or len({*pair} & placed) == 1]
+    if not missing:
+        return "They have no matches with the others at all."
+
+    def strength(pair: Pair) -> tuple[float, int]:
+        edge = evidence.edges.get(pair)
+        return (edge.weight if edge else 0.0, evidence.matches[pair])
+
+    pair = min(missing, key=lambda pair: (tuple(-value for value in strength(pair)), pair))
+    first, second = names[pair[0]], names[pair[1]]
+    matches = evidence.matches[pair]
+    edge = evidence.edges.get(pair)
+    agreeing = len(edge.inliers) if edge else 0
+    share = 100 * agreeing / max(matches, 1)
+    return (
+        f"Even the most alike, '{first}' and '{second}', share too little: {matches} spots look "
+        f"alike, of which {agreeing} ({share:.0f} %) agree on where the camera stood."
+    )
+
+
+def _advice(attempt: Attempt) -> str:
+    text = (
+        "Add a photograph between them, turned no more than 20 degrees against either, sharp and "
+        "with the same zoom (or take a short video that sweeps around)."
+    )
+    if not attempt.focal_known:
+        text += (
+            " Keep the EXIF data of the photographs, or give the focal length over the long side "
+            "of the image with --set init.focal=1.2, if you know it."
+        )
+    return text
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:6])
+    return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more"

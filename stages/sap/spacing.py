@@ -1,0 +1,49 @@
+"""How far apart the points of a cloud lie: nearest-neighbour spacing and 3DGS's first scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+Array = npt.NDArray[np.float32]
+
+#: Least squared distance, as in 3DGS: doubled points must not get scale zero.
+MIN_SQUARED_DISTANCE = 1e-7
+
+
+def point_scales(positions: npt.NDArray[np.floating], threads: int = 1) -> Array:
+    """Scale of each point as 3DGS initialises it.
+
+    sigma = sqrt(mean of the squared distances to the 3 nearest neighbours), the mean at least
+    1e-7 (Kerbl et al., "3D Gaussian Splatting", section 5).
+
+    Args:
+        positions: [N, 3] world points.
+        threads: of the search; does not change the result.
+
+    Returns:
+        [N] float32 in world units. With fewer than 4 points, the neighbours that there are count;
+        a single point gets sqrt(1e-7).
+    """
+    count = len(positions)
+    neighbours = min(3, count - 1)
+    if neighbours < 1:
+        return np.full(count, np.sqrt(MIN_SQUARED_DISTANCE), np.float32)
+    points = np.asarray(positions, np.float64)
+    distance, _ = cKDTree(points).query(points, k=neighbours + 1, workers=max(threads, 1))
+    squared = np.maximum((distance[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)
+    return np.sqrt(squared).astype(np.float32)
+
+
+def median_spacing(
+    positions: npt.NDArray[np.floating], threads: int = 1, sample: int = 20_000
+) -> float:
+    """Median distance to the nearest neighbour, of an even sample of at most `sample` points."""
+    count = len(positions)
+    if count < 2:
+        return 0.0
+    points = np.asarray(positions, np.float64)
+    chosen = points[:: max(1, count // sample)]
+    distance, _ = cKDTree(points).query(chosen, k=2, workers=max(threads, 1))
+    return float(np.median(distance[:, 1]))

@@ -1,0 +1,61 @@
+"""Adam (Kingma & Ba 2015) on a packed matrix with a learning rate per column, as a numba kernel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+Floats = npt.NDArray[np.float32]
+F = np.float32
+CHUNK = 256
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def adam_step(  # type: ignore[no-untyped-def]
+    parameters: Floats, gradient: Floats, first: Floats, second: Floats, rates: Floats,
+    scale_first: float, scale_second: float, beta1: float, beta2: float, epsilon: float,
+):  # fmt: skip
+    """One step in place on [N, D]; `rates` [D]; `scale_*` = 1 / (1 - beta ** step)."""
+    number, columns = parameters.shape
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            for j in range(columns):
+                g = gradient[i, j]
+                m = beta1 * first[i, j] + (F(1) - beta1) * g
+                v = beta2 * second[i, j] + (F(1) - beta2) * g * g
+                first[i, j] = m
+                second[i, j] = v
+                step = rates[j] * (m * scale_first) / (math.sqrt(v * scale_second) + epsilon)
+                parameters[i, j] -= step
+
+
+class Adam:
+    """Adam's state for a packed matrix whose rows come and go.
+
+    Attributes:
+        first, second: [N, D] float32 moments.
+        steps: steps taken.
+    """
+
+    def __init__(self, shape: tuple[int, int], beta1: float, beta2: float, epsilon: float) -> None:
+        self.first: Floats = np.zeros(shape, np.float32)
+        self.second: Floats = np.zeros(shape, np.float32)
+        self.steps = 0
+        self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
+
+    def step(self, parameters: Floats, gradient: Floats, rates: Floats) -> None:
+        """Move `parameters` in place."""
+        self.steps += 1
+        adam_step(
+            parameters, gradient, self.first, self.second, rates,
+            F(1 / (1 - self.beta1**self.steps)), F(1 / (1 - self.beta2**self.steps)),
+            F(self.beta1), F(self.beta2), F(self.epsilon),
+        )  # fmt: skip
+
+    def select(self, source: npt.NDArray[np.int64], fresh: npt.NDArray[np.bool_]) -> None:
+        """Rows follow `source` [N']; where `fresh` [N'] they start from zero."""
+        self.first = np.where(fresh[:, None], F(0), self.first[source])
+        self.second = np.where(fresh[:, None], F(0), self.second[source])

@@ -1,0 +1,72 @@
+"""Pictures of finished Gaussians, for export and evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.gaussians import Gaussians
+from stages.splatting.rasterizer import Viewpoint, pack, rasterize, use_threads
+
+Floats = npt.NDArray[np.float32]
+
+#: near plane as a fraction of the median depth of what lies in front of the camera
+NEAR_FRACTION = 0.02
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """Attributes:
+    image: [H, W, 3] float32 sRGB, composited over the background (not clipped above 1).
+    alpha: [H, W] float32 in 0..1.
+    depth: [H, W] float32, blended z of the Gaussians divided by alpha; 0 where alpha is 0.
+    """
+
+    image: Floats
+    alpha: Floats
+    depth: Floats
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    threads: int | None = None,
+    near: float | None = None,
+) -> RenderedView:
+    """Render Gaussians as a camera sees them.
+
+    Args:
+        gaussians: the scene.
+        camera: with the size of the picture.
+        background: sRGB colour behind everything.
+        threads: how many to use (None: all); never changes the result.
+        near: near plane in world units; None: 2 % of the median depth in front of the camera.
+    """
+    use_threads(threads)
+    packed = pack(
+        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
+        gaussians.sh,
+    )  # fmt: skip
+    # trailing harmonics that are zero everywhere cost time and change nothing
+    degree = 3
+    while degree > 0 and not gaussians.sh[:, degree * degree : (degree + 1) ** 2].any():
+        degree -= 1
+    if near is None:
+        z = gaussians.means @ camera.rotation[2].astype(np.float32) + np.float32(
+            camera.translation[2]
+        )
+        ahead = z[z > 0]
+        near = NEAR_FRACTION * float(np.median(ahead)) if len(ahead) else 1e-6
+    result = rasterize(packed, Viewpoint.of(camera), degree=degree, near=near, depth=True)
+    alpha = 1 - result.transmittance
+    behind = np.asarray(background, np.float32)
+    image = result.planes[:3].transpose(1, 2, 0) + result.transmittance[..., None] * behind
+    depth = np.where(alpha > 0, result.planes[3] / np.maximum(alpha, 1e-8), 0)
+    return RenderedView(
+        np.ascontiguousarray(image, np.float32), alpha, np.asarray(depth, np.float32)
+    )

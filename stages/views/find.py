@@ -1,0 +1,252 @@
+"""Find the files that a request means: folders, files, patterns, one film; and their masks."""
+
+from __future__ import annotations
+
+import glob
+import os
+import stat
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+from pipeline.errors import RequestError, nearest
+from stages.views.sampling import natural_key
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
+)  # fmt: skip
+MASK_PREFIX = "masks/"
+KINDS_OF_IMAGE = "JPEG, PNG, TIFF, WebP, HEIC or BMP"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a folder holds: a name, and whether it is a folder itself."""
+
+    path: Path
+    is_folder: bool
+
+
+def list_folder(folder: Path) -> list[Entry]:
+    """What lies directly in a folder, hidden files left out, in natural order.
+
+    Raises:
+        RequestError: it can't be read.
+    """
+    try:
+        with os.scandir(folder) as found:
+            entries = [Entry(Path(e.path), e.is_dir()) for e in found if e.name[:1] != "."]
+    except PermissionError as error:
+        raise RequestError(
+            f"The folder {folder} can't be read: permission denied. Give yourself the right to "
+            "read it (chmod u+rx), or copy the photographs elsewhere."
+        ) from error
+    except OSError as error:
+        raise RequestError(
+            f"The folder {folder} can't be read: {error.strerror or error}. Check that the disk or "
+            "network share is there, or copy the photographs elsewhere."
+        ) from error
+    return sorted(entries, key=lambda entry: natural_key(entry.path.name))
+
+
+def is_image(path: PurePath) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def is_video(path: PurePath) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
+    """Expand a request to label -> file, in natural order.
+
+    Args:
+        requested: folders (the images directly in them), image files, patterns such as
+            ``photos/*.jpg``, or one video.
+
+    Returns:
+        Labels are file names; where two files share one, the folder's name comes before it.
+
+    Raises:
+        RequestError: something is missing, unreadable or not an image; a video among images; fewer
+            than two images.
+    """
+    files: dict[Path, None] = {}
+    for item in requested:
+        for path in _expand(item):
+            files[Path(os.path.abspath(path))] = None  # noqa: PTH100 (keeps symbolic links)
+    paths = list(files)
+    videos = [path for path in paths if is_video(path)]
+    if videos:
+        if len(paths) > 1:
+            others = "other videos" if len(videos) == len(paths) else "photographs"
+            raise RequestError(
+                f"The video {videos[0].name} was named together with {others} "
+                f"({len(paths)} files in all). A case is either one video or a set of photographs: "
+                "name only the video, or only the photographs."
+            )
+        return {videos[0].name: videos[0]}
+    if len(paths) < 2:
+        what = f"only one photograph was ({paths[0].name})" if paths else "no photograph was"
+        raise RequestError(
+            f"A 3D scene needs at least two photographs from different sides, better three or "
+            f"more; {what} named. Name a folder of photographs, several files, or a video."
+        )
+    labels = _labels(paths)
+    return {label: labels[label] for label in sorted(labels, key=natural_key)}
+
+
+def find_masks(folder: Path, labels: Iterable[str]) -> dict[str, Path]:
+    """Match mask files to images by name: label of the image -> mask file.
+
+    A mask is named as its image, with its own suffix (``a.png`` for ``a.jpg``) or after it
+    (``a.jpg.png``, as COLMAP has it).
+
+    Raises:
+        RequestError: the folder is missing or unreadable; a mask fits no image, or several; two
+            masks fit one.
+    """
+    folder = Path(folder).expanduser()
+    labels = list(labels)
+    if not _stat(folder):
+        raise RequestError(
+            f"The mask folder {folder} does not exist. Correct views.masks, or leave it out to use "
+            "the whole of every photograph."
+        )
+    found: dict[str, Path] = {}
+    for entry in list_folder(folder):
+        mask = entry.path
+        if entry.is_folder or not is_image(mask):
+            continue
+        fitting = [label for label in labels if PurePath(label).name == mask.stem]
+        fitting = fitting or [label for label in labels if PurePath(label).stem == mask.stem]
+        if len(fitting) != 1:
+            problem = (
+                f"several photographs ({', '.join(fitting[:3])})" if fitting else "no photograph"
+            )
+            raise RequestError(
+                f"The mask {mask.name} in {folder} fits {problem}. A mask bears the name of its "
+                f"photograph, as {PurePath(labels[0]).stem}.png for {labels[0]}. Rename or remove "
+                "it."
+            )
+        if fitting[0] in found:
+            raise RequestError(
+                f"Two masks in {folder}, {found[fitting[0]].name} and {mask.name}, fit the "
+                f"photograph {fitting[0]}. Remove one."
+            )
+        found[fitting[0]] = mask
+    if not found:
+        raise RequestError(
+            f"The mask folder {folder} holds no masks ({_describe(list_folder(folder))}). Masks "
+            "are images named as the photographs, bright where these may be used."
+        )
+    return found
+
+
+def _expand(item: str | Path) -> list[Path]:
+    path = Path(item).expanduser()
+    status = _stat(path)
+    if status is None:
+        if glob.has_magic(str(path)):
+            return _expand_pattern(path)
+        raise RequestError(
+            f"There is no file or folder {path}.{_hint(path)} Name a folder of photographs, "
+            "several files, a pattern in quotes such as 'photos/*.jpg', or a video."
+        )
+    if stat.S_ISDIR(status.st_mode):
+        return _expand_folder(path)
+    if not is_image(path) and not is_video(path):
+        raise RequestError(
+            f"The file {path.name} is neither a photograph nor a video by its name "
+            f"('{path.suffix or 'no suffix'}'). Photographs are {KINDS_OF_IMAGE}; videos are MP4, "
+            "MOV, MKV, AVI or WebM. Convert it, or leave it out."
+        )
+    return [path]
+
+
+def _expand_pattern(path: Path) -> list[Path]:
+    matches = [Path(match) for match in glob.glob(str(path), recursive=True)]  # noqa: PTH207
+    usable = [m for m in matches if (is_image(m) or is_video(m)) and not m.is_dir()]
+    if not usable:
+        what = (
+            f"matches {len(matches)} files, none of them a photograph"
+            if matches
+            else "matches nothing"
+        )
+        raise RequestError(
+            f"The pattern {path} {what}. Check the folder and the suffix (patterns tell JPG from "
+            "jpg), and put it in quotes so that the shell leaves it alone."
+        )
+    return usable
+
+
+def _expand_folder(folder: Path) -> list[Path]:
+    entries = list_folder(folder)
+    images = [entry.path for entry in entries if is_image(entry.path) and not entry.is_folder]
+    if images:
+        return images
+    videos = [entry.path.name for entry in entries if is_video(entry.path)]
+    advice = f"Photographs are {KINDS_OF_IMAGE}."
+    if videos:
+        advice = f"To use the video, name it: {folder / videos[0]}"
+    else:
+        for entry in entries:
+            if entry.is_folder and any(is_image(inner.path) for inner in _try_list(entry.path)):
+                advice = f"Did you mean the folder in it: {entry.path}"
+                break
+    raise RequestError(f"There is no photograph in {folder} ({_describe(entries)}). {advice}")
+
+
+def _try_list(folder: Path) -> list[Entry]:
+    try:
+        return list_folder(folder)
+    except RequestError:
+        return []
+
+
+def _describe(entries: Sequence[Entry]) -> str:
+    """What a folder holds, in a few words."""
+    if not entries:
+        return "it is empty"
+    shown = ", ".join(entry.path.name + ("/" if entry.is_folder else "") for entry in entries[:4])
+    more = f" and {len(entries) - 4} more" if len(entries) > 4 else ""
+    return f"it holds {shown}{more}"
+
+
+def _stat(path: Path) -> os.stat_result | None:
+    try:
+        return path.stat()
+    except PermissionError as error:
+        raise RequestError(
+            f"{path} can't be read: permission denied. Give yourself the right to read the folder "
+            "it lies in, or copy the photographs elsewhere."
+        ) from error
+    except (OSError, ValueError):  # missing, a loop of links, a name too long
+        return None
+
+
+def _hint(path: Path) -> str:
+    """The name nearest to a missing one, from the folder where it should lie."""
+    parent = path.parent
+    names = [entry.path.name for entry in _try_list(parent)] if parent.is_dir() else []
+    return nearest(path.name, names)
+
+
+def _labels(paths: Sequence[Path]) -> dict[str, Path]:
+    """Shortest names that tell the files apart: file name, or with as many folders as it takes."""
+    labels: dict[str, Path] = {}
+    waiting, depth = list(paths), 1
+    while waiting:
+        tails = {path: "/".join(path.parts[-depth:]) for path in waiting}
+        counts: dict[str, int] = {}
+        for tail in tails.values():
+            counts[tail] = counts.get(tail, 0) + 1
+        unique = [path for path in waiting if counts[tails[path]] == 1 or depth > len(path.parts)]
+        for path in unique:
+            tail = tails[path]
+            label = f"images/{tail}" if tail.startswith(MASK_PREFIX) else tail
+            labels[label] = path
+        waiting = [path for path in waiting if path not in set(unique)]
+        depth += 1
+    return labels

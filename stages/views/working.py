@@ -1,0 +1,120 @@
+"""Bring a decoded picture to its working size: upright, small, with the pixel transform kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.views.decode import UnusableImage
+from stages.views.orientation import make_upright, upright_from_stored
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A picture at working size.
+
+    Attributes:
+        rgb: [H, W, 3] uint8 sRGB, upright.
+        mask: [H, W] bool, or None for all.
+        working_from_source: [3, 3] from the stored grid, pixel centres at .5.
+        source_size: (width, height) of that grid.
+        focal_px: focal length in working pixels, or None.
+    """
+
+    rgb: npt.NDArray[np.uint8]
+    mask: Mask | None
+    working_from_source: npt.NDArray[np.float64]
+    source_size: tuple[int, int]
+    focal_px: float | None
+
+
+def working_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """Size with the long side at most `long_side`; smaller pictures keep theirs."""
+    scale = min(1.0, long_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def check_size(width: int, height: int, long_side: int, min_side: int) -> None:
+    """Raise UnusableImage where the short side would come out below `min_side`."""
+    short = min(working_size(width, height, long_side))
+    if short < min_side:
+        raise UnusableImage(
+            f"is {width} x {height} pixels: at the working size its short side would be "
+            f"{short} pixel{'s' if short > 1 else ''}, and {min_side} is the least "
+            "(views.min_side). Is it a scan line or a thumbnail?"
+        )
+
+
+def prepare(
+    rgb: npt.NDArray[np.uint8], valid: Mask | None, orientation: int, focal_px: float | None,
+    long_side: int, given_mask: Mask | None = None,
+) -> Prepared:  # fmt: skip
+    """Resize (area-averaged, so that fine detail can't alias), then turn upright.
+
+    Args:
+        rgb: [H, W, 3] on the stored grid.
+        valid: [H, W] on the stored grid, or None.
+        orientation: EXIF orientation to apply.
+        focal_px: in stored pixels, or None.
+        long_side: of the result, at most.
+        given_mask: a mask file: upright or stored size, or either's shape at another size.
+
+    Raises:
+        UnusableImage: the mask has another shape than the picture, or leaves nothing of it.
+    """
+    height, width = rgb.shape[:2]
+    small = working_size(width, height, long_side)
+    scale = np.diag([small[0] / width, small[1] / height, 1.0])
+    picture = make_upright(_shrink(rgb, small), orientation)
+    share = None if valid is None else make_upright(_share(valid, small), orientation)
+    if given_mask is not None:
+        given = _share(_fit_mask(given_mask, width, height, orientation), picture.shape[1::-1])
+        share = given if share is None else np.minimum(share, given)
+    mask = None if share is None else share >= 0.5
+    if mask is not None and not mask.any():
+        raise UnusableImage("is masked completely (by its mask file or its transparency)")
+    if mask is not None and mask.all():
+        mask = None
+    return Prepared(
+        rgb=picture,
+        mask=mask,
+        working_from_source=upright_from_stored(orientation, *small) @ scale,
+        source_size=(width, height),
+        focal_px=None if focal_px is None else focal_px * float(scale[0, 0] + scale[1, 1]) / 2,
+    )
+
+
+def _shrink(pixels: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray[Any]:
+    if pixels.shape[1::-1] == size:
+        return pixels
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def _share(mask: Mask, size: Any) -> npt.NDArray[np.float32]:
+    """[H, W] share of each pixel of the new size that is valid."""
+    return np.asarray(_shrink(mask.astype(np.float32), (int(size[0]), int(size[1]))))
+
+
+def _fit_mask(mask: Mask, width: int, height: int, orientation: int) -> Mask:
+    """The mask, upright: as it is if it has the upright shape, else turned like the picture."""
+    upright = (height, width) if orientation >= 5 else (width, height)
+    size = mask.shape[1::-1]
+    if _same_shape(size, upright):
+        return mask
+    if _same_shape(size, (width, height)):
+        return make_upright(mask, orientation)
+    raise UnusableImage(
+        f"has {upright[0]} x {upright[1]} pixels, but its mask {size[0]} x {size[1]}: the mask "
+        "must have the picture's proportions"
+    )
+
+
+def _same_shape(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
+    """Equal up to scale, within the rounding of the sizes to whole pixels."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= max(*a, *b)

@@ -1,0 +1,146 @@
+"""Similarities, the cameras' arrangement, and paths between them."""
+
+from importlib import util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline.artifacts.cameras import Camera
+from stages.export.frame import (
+    harmonics,
+    harmonics_rotation,
+    move_cameras,
+    move_gaussians,
+    move_points,
+    split_similarity,
+)
+from stages.export.orbits import between, central_depth, find_orbit, look_at, there_and_back
+from stages.splatting.rendering import render
+
+_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
+assert _spec and _spec.loader
+scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(scene)
+
+
+def similarity(scale: float = 23.0) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    matrix[:3, 3] = [5.0, -40.0, 12.0]
+    return matrix
+
+
+def test_a_moved_scene_looks_the_same_to_moved_cameras() -> None:
+    gaussians, camera = scene.ball_gaussians(degree=3), scene.ball_cameras()[0]
+    before = render(gaussians, camera)
+    (moved_camera,) = move_cameras([camera], similarity())
+    after = render(move_gaussians(gaussians, similarity()), moved_camera)
+    assert before.alpha.max() > 0.9
+    # single pixels differ by more where rounding decides about the 1/255 cut
+    assert np.abs(after.image - before.image).mean() < 1e-4
+    assert np.abs(after.image - before.image).max() < 0.02
+    solid = before.alpha > 0.5
+    np.testing.assert_allclose(after.depth[solid], 23.0 * before.depth[solid], rtol=1e-3)
+
+
+def test_moving_keeps_degrees_that_are_not_used_at_zero() -> None:
+    moved = move_gaussians(scene.ball_gaussians(degree=1), similarity())
+    assert moved.sh[:, 1:4].any()
+    assert not moved.sh[:, 4:].any()
+
+
+def test_points_move_with_the_cameras() -> None:
+    camera, points = scene.ball_cameras()[2], scene.ball_points()
+    (moved,) = move_cameras([camera], similarity())
+    there = move_points(points, similarity())
+    np.testing.assert_allclose(
+        moved.project(there.positions)[0], camera.project(points.positions)[0], atol=1e-3
+    )
+    np.testing.assert_allclose(np.linalg.norm(there.normals, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(there.scale, 23 * points.scale, rtol=1e-5)
+
+
+def test_rotated_harmonics_are_the_harmonics_of_rotated_directions() -> None:
+    random = np.random.default_rng(0)
+    directions = random.standard_normal((50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    coefficients = random.standard_normal(16)
+    rotation = Rotation.from_rotvec([0.3, 2.0, -0.5]).as_matrix()
+    turned = harmonics_rotation(rotation) @ coefficients
+    np.testing.assert_allclose(
+        harmonics(directions @ rotation.T) @ turned, harmonics(directions) @ coefficients, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.diag([1.0, 1, -1, 1]), np.diag([1.0, 2, 1, 1]), np.diag([0.0, 0, 0, 1])]
+)
+def test_what_is_no_similarity_is_refused(matrix: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="not a similarity"):
+        split_similarity(matrix)
+
+
+def test_the_orbit_is_found() -> None:
+    cameras = scene.ball_cameras()
+    depths = []
+    for camera in cameras:
+        view = render(scene.ball_gaussians(), camera)
+        depths.append(central_depth(view.depth, view.alpha))
+    assert all(2.9 < depth < 3.6 for depth in depths if depth)
+    orbit = find_orbit(cameras, [4.0, 4.0, None])
+    np.testing.assert_allclose(orbit.up, [0, -1, 0], atol=0.02)
+    assert np.linalg.norm(orbit.centre) < 0.2
+    np.testing.assert_allclose(np.abs(np.degrees(orbit.azimuths)), [35, 0, 35], atol=3)
+    assert orbit.azimuths[0] * orbit.azimuths[2] < 0
+    assert orbit.middle() == 1
+    np.testing.assert_allclose(np.cross(orbit.up, orbit.front) @ orbit.side, 1)
+
+
+def test_look_at_keeps_up_upwards_and_does_not_mirror() -> None:
+    pose = look_at(np.array([3.0, -1, 2]), np.array([0.5, 0, 0]), np.array([0, -1.0, 0]))
+    camera = Camera("", 100, 100, 100, 100, 50, 50, pose)
+    pixels, depth = camera.project(np.array([[0.5, 0, 0], [0.5, -0.3, 0]]))
+    np.testing.assert_allclose(pixels[0], [50, 50])
+    assert depth[0] > 0
+    assert pixels[1, 1] < 50, "what is above must be drawn above"
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+
+
+def test_the_path_passes_through_the_cameras_and_loops_smoothly() -> None:
+    cameras = scene.ball_cameras()
+    orbit = find_orbit(cameras, [3.0] * 3)
+    path = there_and_back(orbit, cameras, (64, 48), 200, 0.0)
+    eyes = np.stack([camera.centre for camera in path])
+    for camera in cameras:
+        nearest = np.linalg.norm(eyes - camera.centre, axis=1).argmin()
+        assert np.linalg.norm(eyes[nearest] - camera.centre) < 0.05
+        assert path[nearest].rotation[2] @ camera.rotation[2] > np.cos(np.radians(1.5))
+    steps = np.linalg.norm(np.diff(eyes, axis=0, append=eyes[:1]), axis=1)
+    assert steps.max() < 2.5 * np.median(steps)
+    assert all((camera.width, camera.height) == (64, 48) for camera in path)
+
+
+def test_a_path_through_many_shaky_cameras_is_smooth() -> None:
+    random = np.random.default_rng(1)
+    cameras = []
+    for degrees in np.linspace(-50, 50, 24):
+        a = np.radians(degrees)
+        eye = 4 * np.array([np.sin(a), 0, -np.cos(a)]) + 0.1 * random.standard_normal(3)
+        pose = look_at(eye, 0.1 * random.standard_normal(3), np.array([0, -1.0, 0]))
+        cameras.append(Camera("", 64, 48, 60, 60, 32, 24, pose))
+    orbit = find_orbit(cameras, [4.0] * 24)
+    eyes = np.stack([camera.centre for camera in between(orbit, cameras, 101)])
+    bend = np.linalg.norm(np.diff(eyes, 2, axis=0), axis=1)
+    assert bend.max() < 0.02
+    assert np.linalg.norm(eyes - orbit.centre, axis=1) == pytest.approx(4, abs=0.2)
+
+
+def test_a_single_camera_still_gets_a_small_orbit() -> None:
+    (camera,) = scene.ball_cameras()[1:2]
+    orbit = find_orbit([camera], [None])
+    path = there_and_back(orbit, [camera], (64, 48), 20, 0.03)
+    eyes = np.stack([camera.centre for camera in path])
+    assert 0.1 < np.ptp(eyes[:, 0]) < 2
+    assert np.isfinite(eyes).all()

@@ -1,0 +1,213 @@
+"""The flow stage on a scene whose flow is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.flow import Flow, FlowPair
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import RequestError
+from pipeline.stage import LocalContext, get_stage
+from stages.flow.geometry import occluded, predicted_flow
+from stages.flow.stage import FlowConfig, FlowStage
+
+_spec = util.spec_from_file_location("flow_scene", Path(__file__).with_name("flow_scene.py"))
+assert _spec and _spec.loader
+scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(scene)
+
+Shot = tuple[Camera, View, np.ndarray]
+
+
+def shoot(*angles: float, **size: int) -> list[Shot]:
+    """Photograph the scene from these angles: camera, view, exact depth."""
+    cameras = [scene.camera(f"{k:03d}", angle, **size) for k, angle in enumerate(angles)]
+    return [(camera, *scene.photograph(camera)) for camera in cameras]
+
+
+def context(folder: Path, shots: list[Shot], kinds: str = "cp", **config: Any) -> LocalContext:
+    """`kinds`: c for cameras, p for points."""
+    inputs: dict[str, Any] = {"views": Views(tuple(view for _, view, _ in shots))}
+    if "c" in kinds:
+        inputs["cameras"] = Cameras(tuple(camera for camera, _, _ in shots))
+    if "p" in kinds:
+        inputs["points"] = scene.cloud()
+    return LocalContext(FlowConfig(**config), folder, inputs, threads=2)
+
+
+def run(context: LocalContext) -> Flow:
+    FlowStage().run(context)
+    flow = context.result("flow")
+    assert isinstance(flow, Flow)
+    return flow
+
+
+def errors(a: Shot, b: Shot, flow: np.ndarray) -> np.ndarray:
+    """Distance in pixels from the true flow; infinite where the point is hidden in b."""
+    truth, depth_in_b = predicted_flow(a[2], a[0], b[0])
+    error = np.linalg.norm(flow - truth, axis=-1)
+    return np.where(occluded(truth, depth_in_b, b[2], 0.02), np.inf, error)
+
+
+def both_ways(shots: list[Shot], pair: FlowPair) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(errors, mask) forward and backward."""
+    by_name = {shot[1].name: shot for shot in shots}
+    i, j = by_name[pair.name_i], by_name[pair.name_j]
+    return [
+        (errors(i, j, pair.forward), pair.mask_forward),
+        (errors(j, i, pair.backward), pair.mask_backward),
+    ]
+
+
+def test_registered() -> None:
+    assert isinstance(get_stage("flow"), FlowStage)
+
+
+@pytest.mark.parametrize("method", ["dis", "farneback"])
+def test_flow_of_a_wide_pair_is_right_where_it_is_trusted(tmp_path: Path, method: str) -> None:
+    shots = shoot(-10, 10)
+    local = context(tmp_path, shots, method=method)
+    (pair,) = run(local).pairs
+    for error, mask in both_ways(shots, pair):
+        assert mask.mean() > 0.4
+        assert (error[mask] < 1).mean() > 0.97
+        assert np.median(error[mask]) < 0.2
+    assert local.figures["pairs"] == 1
+    assert local.figures["prewarp"] == "true"
+    assert 0.4 < local.figures["trusted_share"] < 1
+    assert local.figures["median_px_from_geometry"] < 0.3
+    assert not local.warnings
+
+
+def test_flow_corrects_cameras_that_are_slightly_wrong(tmp_path: Path) -> None:
+    shots = shoot(-10, 10)
+    turned = scene.camera("001", 11.2)  # further along its circle
+    wrong = replace(shots[1][0], cam_from_world=turned.cam_from_world)
+    local = context(tmp_path, [shots[0], (wrong, *shots[1][1:])])
+    (pair,) = run(local).pairs
+    for error, mask in both_ways(shots, pair):
+        assert mask.mean() > 0.4
+        assert (error[mask] < 1).mean() > 0.95
+    assert local.figures["median_px_from_geometry"] > 0.5  # tells of the wrong camera
+
+
+def test_prewarp_is_what_makes_a_wide_pair_work(tmp_path: Path) -> None:
+    shots = shoot(-10, 10)
+    right = {}
+    for prewarp in ("off", "on"):
+        (pair,) = run(context(tmp_path / prewarp, shots, prewarp=prewarp)).pairs
+        ways = both_ways(shots, pair)
+        right[prewarp] = np.mean([(mask & (error < 1)).mean() for error, mask in ways])
+    assert right["on"] > right["off"] + 0.2
+
+
+def test_masks_bound_the_trust_on_both_sides(tmp_path: Path) -> None:
+    shots = shoot(-4, 4)
+    masks = [np.ones((120, 160), bool) for _ in shots]
+    masks[0][:60] = False
+    masks[1][:, :80] = False
+    masked = [(c, replace(v, mask=m), z) for (c, v, z), m in zip(shots, masks, strict=True)]
+    (pair,) = run(context(tmp_path, masked)).pairs
+    assert not pair.mask_forward[:60].any()
+    assert not pair.mask_backward[:, :80].any()
+    assert pair.mask_forward.sum() > 1000
+    rows, columns = np.nonzero(pair.mask_forward)
+    landing = columns + pair.forward[rows, columns, 0]
+    assert landing.min() >= 80
+    rows, columns = np.nonzero(pair.mask_backward)
+    assert (rows + pair.backward[rows, columns, 1]).min() >= 60
+
+
+@pytest.mark.parametrize("kinds", ["", "cp"])
+def test_views_of_different_sizes(tmp_path: Path, kinds: str) -> None:
+    small, large = shoot(-2, width=120, height=90), shoot(2, width=200, height=150)
+    camera, view, depth = large[0]
+    shots = [*small, (replace(camera, name="001"), replace(view, name="001"), depth)]
+    (pair,) = run(context(tmp_path, shots, kinds)).pairs
+    assert pair.forward.shape == (90, 120, 2)
+    assert pair.backward.shape == (150, 200, 2)
+    for error, mask in both_ways(shots, pair):
+        assert mask.mean() > 0.5
+        assert (error[mask] < 1).mean() > 0.95
+
+
+def test_pairs_follow_the_cameras_not_the_names(tmp_path: Path) -> None:
+    shots = shoot(5, -5, 15, 0, width=64, height=48)
+    flow = run(context(tmp_path / "a", shots))
+    # In space: 1, 3, 0, 2.
+    assert [(p.name_i, p.name_j) for p in flow.pairs] == [
+        ("000", "002"), ("001", "003"), ("003", "000"),
+    ]  # fmt: skip
+    flow = run(context(tmp_path / "b", shots, kinds=""))
+    assert [(p.name_i, p.name_j) for p in flow.pairs] == [
+        ("000", "001"), ("001", "002"), ("002", "003"),
+    ]  # fmt: skip
+
+
+def test_unplaced_views_and_wide_pairs_are_left_out(tmp_path: Path) -> None:
+    shots = shoot(0, 10, 50, -10, width=64, height=48)
+    local = context(tmp_path, shots, max_angle=30)
+    local.inputs = {**local.inputs, "cameras": Cameras(tuple(shot[0] for shot in shots[:3]))}
+    flow = run(local)
+    assert [(p.name_i, p.name_j) for p in flow.pairs] == [("000", "001")]
+    assert len(local.warnings) == 1
+    assert "001 and 002" in local.warnings[0]
+    assert local.figures["pairs_too_wide"] == 1
+
+
+@pytest.mark.parametrize(
+    ("angles", "config", "message"),
+    [((0, 20, 40), {"max_angle": 15}, "close enough"), ((0,), {}, "two views")],
+)
+def test_no_pair_gives_an_empty_flow_and_says_why(
+    tmp_path: Path, angles: tuple[float, ...], config: dict[str, float], message: str
+) -> None:
+    local = context(tmp_path, shoot(*angles, width=64, height=48), **config)
+    assert len(run(local)) == 0
+    assert len(local.warnings) == 1
+    assert message in local.warnings[0]
+    assert local.figures["pairs"] == 0
+
+
+def test_flow_that_cannot_be_trusted_is_said(tmp_path: Path) -> None:
+    shots = shoot(-4, 4, width=64, height=48)
+    mask = np.zeros((48, 64), bool)
+    mask[20:28, 28:36] = True
+    camera, view, depth = shots[1]
+    local = context(tmp_path, [shots[0], (camera, replace(view, mask=mask), depth)])
+    run(local)
+    assert len(local.warnings) == 1
+    assert "000 and 001" in local.warnings[0]
+
+
+def test_prewarp_without_geometry_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="needs cameras and points"):
+        run(context(tmp_path, shoot(-2, 2, width=64, height=48), "c", prewarp="on"))
+
+
+@pytest.mark.parametrize("method", ["dis", "farneback"])
+def test_bytes_do_not_depend_on_threads(tmp_path: Path, method: str) -> None:
+    shots = shoot(-4, 4)
+    written = []
+    before = cv2.getNumThreads()
+    try:
+        for threads in (1, 2, 2):
+            cv2.setNumThreads(threads)
+            local = context(tmp_path / str(len(written)), shots, method=method)
+            local.threads = threads
+            run(local)
+            assert cv2.getNumThreads() == threads  # given back as found
+            files = sorted((local.folder / "flow").iterdir())
+            written.append({path.name: path.read_bytes() for path in files})
+    finally:
+        cv2.setNumThreads(before)
+    assert len(written[0]) == 4
+    assert written[0] == written[1] == written[2]

@@ -1,0 +1,260 @@
+"""The stage `views` as a whole: files in, artifact out, nothing private in it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from pipeline.artifacts.views import Views
+from pipeline.errors import RequestError
+from pipeline.stage import LocalContext
+from stages.views.stage import ViewsConfig, ViewsStage
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
+Bytes = npt.NDArray[np.uint8]
+
+
+def picture(seed: int, width: int = 120, height: int = 90) -> Bytes:
+    random = np.random.default_rng(seed)
+    small = random.integers(0, 255, (9, 12, 3), np.uint8)
+    return np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC))
+
+
+def write(path: Path, pixels: Bytes, **options: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+def run_stage(
+    folder: Path, images: list[Any], **settings: Any
+) -> tuple[Views, LocalContext, list[tuple[Any, ...]]]:
+    config = ViewsConfig(**settings)
+    stage = ViewsStage()
+    steps: list[tuple[Any, ...]] = []
+    context = LocalContext(
+        config=config,
+        folder=folder,
+        sources=stage.sources(config, {"images": images}),
+        threads=2,
+        on_progress=lambda *step: steps.append(step),
+    )
+    stage.run(context)
+    views: Views = context.result("views")
+    return views, context, steps
+
+
+def test_a_folder(tmp_path: Path) -> None:
+    files = [write(tmp_path / "in" / f"p{n}.png", picture(n)) for n in (1, 2, 10)]
+    views, context, steps = run_stage(
+        tmp_path / "out", [tmp_path / "in"], long_side=64, min_side=40
+    )
+    assert [view.name for view in views.views] == ["000", "001", "002"]
+    assert [view.source_name for view in views.views] == ["p1.png", "p2.png", "p10.png"]
+    assert not views.ordered
+    assert context.figures == {"views": 3, "width": 64, "height": 48}
+    assert context.warnings == []
+    assert steps == [("reading", n, 3) for n in (1, 2, 3)]
+    view = views.views[0]
+    assert view.image.shape == (48, 64, 3)
+    assert view.mask is None
+    assert view.source_size == (120, 90)
+    assert view.source_sha256 == hashlib.sha256(files[0].read_bytes()).hexdigest()
+    np.testing.assert_allclose(view.working_from_source, np.diag([64 / 120, 48 / 90, 1]))
+
+
+def test_sources_are_what_is_used(tmp_path: Path) -> None:
+    for n in range(7):
+        write(tmp_path / "in" / f"{n}.png", picture(n))
+        write(tmp_path / "m" / f"{n}.png", np.full((90, 120), 255, np.uint8))
+    stage = ViewsStage()
+    config = ViewsConfig(frames=3, masks=tmp_path / "m")
+    labels = list(stage.sources(config, {"images": [tmp_path / "in"]}))
+    assert labels == ["0.png", "3.png", "6.png", "masks/0.png", "masks/3.png", "masks/6.png"]
+
+
+def test_the_place_of_the_masks_is_not_part_of_the_key() -> None:
+    extra = ViewsConfig.model_fields["masks"].json_schema_extra
+    assert extra == {"affects_result": False}
+
+
+def test_numbered_frames_are_ordered_and_samples_work(tmp_path: Path) -> None:
+    views, _, _ = run_stage(tmp_path, [SAMPLES / "twelve_frames"], frames=6, long_side=128)
+    assert views.ordered
+    assert [view.source_name for view in views.views][:2] == ["000.jpg", "002.jpg"]
+    assert views.views[0].image.shape == (96, 128, 3)
+
+
+def test_mixed_sizes_exif_and_masks(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 50
+    write(tmp_path / "in" / "a.jpg", picture(1, 240, 180), exif=exif)
+    write(tmp_path / "in" / "b.png", picture(2, 200, 200))
+    mask = np.zeros((240, 180), np.uint8)
+    mask[120:] = 255
+    write(tmp_path / "masks" / "a.png", mask)
+    views, _, _ = run_stage(
+        tmp_path / "out", [tmp_path / "in"], masks=tmp_path / "masks", long_side=120
+    )
+    a, b = views.views
+    assert (a.width, a.height) == (90, 120)
+    assert (b.width, b.height) == (120, 120)
+    # 50 mm of a diagonal of 43.27 mm; the diagonal at working size is 150 pixels.
+    assert a.focal_px == pytest.approx(50 / 43.2666 * 150, rel=1e-3)
+    assert b.focal_px is None
+    assert a.mask is not None
+    np.testing.assert_array_equal(a.mask, np.arange(120)[:, None].repeat(90, 1) >= 60)
+    assert b.mask is None
+    # The top left pixel of the stored grid is at the top right of the upright picture.
+    np.testing.assert_allclose(a.working_from_source @ (0.5, 0.5, 1), (89.75, 0.25, 1))
+
+
+def test_duplicates_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "a.png", picture(1))
+    write(tmp_path / "in" / "b.bmp", picture(1))
+    write(tmp_path / "in" / "c.png", picture(2))
+    views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
+    assert [(view.name, view.source_name) for view in views.views] == [
+        ("000", "a.png"),
+        ("001", "c.png"),
+    ]
+    assert len(context.warnings) == 1
+    assert "b.bmp" in context.warnings[0]
+    assert "a.png" in context.warnings[0]
+    kept, context, _ = run_stage(tmp_path / "all", [tmp_path / "in"], deduplicate=False)
+    assert len(kept) == 3
+    assert context.warnings == []
+
+
+def test_fewer_than_asked_for(tmp_path: Path) -> None:
+    for n in range(3):
+        write(tmp_path / "in" / f"{n}.png", picture(n))
+    views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"], frames=8)
+    assert len(views) == 3
+    assert len(context.warnings) == 1
+    assert "only 3" in context.warnings[0]
+
+
+def test_a_blank_picture_is_mentioned(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "a.png", picture(1))
+    write(tmp_path / "in" / "black.png", np.full((90, 120, 3), 4, np.uint8))
+    _, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
+    assert len(context.warnings) == 1
+    assert "black.png" in context.warnings[0]
+
+
+def test_two_identical_images(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write(tmp_path / "in" / name, picture(1))
+    with pytest.raises(RequestError, match=r"a\.png and b\.png: the same picture.*at least two"):
+        run_stage(tmp_path / "out", [tmp_path / "in"])
+
+
+def test_all_that_is_wrong_is_named_at_once(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    write(folder / "good.png", picture(1))
+    whole = io.BytesIO()
+    Image.fromarray(picture(2)).save(whole, "JPEG")
+    (folder / "cut.jpg").write_bytes(whole.getvalue()[:-400])
+    (folder / "note.jpg").write_text("not a picture at all\n")
+    (folder / "zero.jpg").write_bytes(b"")
+    write(folder / "line.png", np.zeros((10, 20000), np.uint8))
+    with pytest.raises(RequestError) as caught:
+        run_stage(tmp_path / "out", [folder])
+    message = str(caught.value)
+    assert message.startswith("4 of 5 photographs can't be used")
+    for part in (
+        "cut.jpg is truncated",
+        "note.jpg is a text file",
+        "zero.jpg is empty",
+        "line.png is 20000 x 10 pixels",
+    ):
+        assert part in message
+    assert "good.png" not in message
+    assert "\n" not in message
+    assert not (tmp_path / "out" / "views").exists()
+
+
+def test_one_bad_file_and_one_bad_mask(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "a.png", picture(1))
+    (tmp_path / "in" / "b.jpg").write_text("text")
+    with pytest.raises(RequestError, match=r"b\.jpg is a text file"):
+        run_stage(tmp_path / "out", [tmp_path / "in"])
+    write(tmp_path / "in" / "b.jpg", picture(2))
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "b.png").write_bytes(b"")
+    with pytest.raises(RequestError, match=r"b\.jpg has a mask \(b\.png\) that is empty"):
+        run_stage(tmp_path / "out", [tmp_path / "in"], masks=tmp_path / "masks")
+
+
+def artifact_bytes(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_threads_do_not_change_the_bytes(tmp_path: Path) -> None:
+    for n in range(5):
+        write(tmp_path / "in" / f"{n}.jpg", picture(n, 300, 200))
+    stage, config = ViewsStage(), ViewsConfig(long_side=150)
+    written = []
+    for threads in (1, 4):
+        folder = tmp_path / str(threads)
+        sources = stage.sources(config, {"images": [tmp_path / "in"]})
+        stage.run(LocalContext(config=config, folder=folder, sources=sources, threads=threads))
+        written.append(artifact_bytes(folder / "views"))
+    assert written[0] == written[1]
+    assert len(written[0]) == 6
+
+
+def check_private(folder: Path, secrets: list[bytes]) -> None:
+    for name, data in artifact_bytes(folder).items():
+        assert b"Exif" not in data
+        assert b"eXIf" not in data
+        assert not any(secret in data for secret in secrets), name
+        if name.endswith(".png"):
+            with Image.open(io.BytesIO(data)) as image:
+                assert not image.getexif()
+                assert not image.info
+
+
+def test_nothing_private_is_carried_on(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x010F] = "SecretMaker"
+    exif[0x013B] = "Patient Name"
+    exif.get_ifd(0x8825)[2] = (52.0, 31.0, 8.1)
+    for n in range(2):
+        write(tmp_path / "hidden_folder" / f"{n}.jpg", picture(n), exif=exif, comment=b"Comment")
+    run_stage(tmp_path / "out", [tmp_path / "hidden_folder"])
+    secrets = [b"SecretMaker", b"Patient", b"Comment", b"hidden_folder", str(tmp_path).encode()]
+    check_private(tmp_path / "out" / "views", secrets)
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(not (DATA / "berlin").exists(), reason="the real photographs are not here")
+def test_gps_of_real_photographs_is_not_carried_on(tmp_path: Path) -> None:
+    views, _, _ = run_stage(tmp_path, [DATA / "berlin" / "images"])
+    assert len(views) == 3
+    with Image.open(sorted((DATA / "berlin" / "images").glob("*.jpg"))[0]) as image:
+        assert image.getexif().get_ifd(0x8825)  # it is there to begin with
+    check_private(
+        tmp_path / "views",
+        [b"MAPLatitude", b"52.51", b"13.40", b"Apple", b"iPhone", b"yubin", str(DATA).encode()],
+    )
+    # A phone's 35 mm lens: between .75 and 1.05 of the long side.
+    for view in views.views:
+        assert view.focal_px is not None
+        assert 0.75 < view.focal_px / max(view.width, view.height) < 1.05
+    assert "berlin" not in json.dumps([view.source_name for view in views.views])

@@ -1,0 +1,176 @@
+"""Films: which frames, when, which way up, and what is said of broken ones."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from pipeline.errors import RequestError
+from pipeline.stage import LocalContext
+from stages.views.stage import ViewsConfig, ViewsStage
+from stages.views.video import read_frames
+
+QUARTER_TURN_CLOCKWISE = (0, 1, -1, 0)  # a, b, c, d: x' = a x + c y, y' = b x + d y
+
+
+def level(index: int) -> int:
+    """Brightness that tells which frame it is."""
+    return 40 + 6 * index
+
+
+def film(
+    path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96)
+) -> Path:
+    """Write a film whose frame n is of brightness `level(n)`, red at the top left."""
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=Fraction(25))
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        if codec == "libx264":
+            stream.options = {"crf": "10", "threads": "1"}
+        else:
+            stream.bit_rate = 8_000_000
+        for index in range(count):
+            pixels = np.full((size[1], size[0], 3), level(index), np.uint8)
+            pixels[:32, :48] = (250, 10, 10)
+            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def turn_film(path: Path, matrix: tuple[int, int, int, int]) -> None:
+    """Set the display matrix in the track header of an MP4."""
+    data = bytearray(path.read_bytes())
+    start = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes before the matrix
+    a, b, c, d = (int(value * 65536).to_bytes(4, "big", signed=True) for value in matrix)
+    zero = bytes(4)
+    data[start : start + 36] = a + b + zero + c + d + zero + zero + zero + (1 << 30).to_bytes(4)
+    path.write_bytes(data)
+
+
+def indices_by_brightness(frames: Any) -> list[int]:
+    return [round((float(frame.rgb[60:, 80:].mean()) - 40) / 6) for frame in frames]
+
+
+@pytest.mark.parametrize(("codec", "name"), [("libx264", "x.mp4"), ("mpeg4", "x.avi")])
+def test_uniform_sampling(tmp_path: Path, codec: str, name: str) -> None:
+    frames = read_frames(film(tmp_path / name, codec=codec), 4)
+    assert [frame.index for frame in frames] == [0, 10, 19, 29]
+    assert indices_by_brightness(frames) == [0, 10, 19, 29]
+    np.testing.assert_allclose([f.seconds for f in frames], [0, 0.4, 0.76, 1.16], atol=1e-6)
+    assert {frame.orientation for frame in frames} == {1}
+
+
+def test_all_frames_of_a_short_film_and_any_thread_count(tmp_path: Path) -> None:
+    path = film(tmp_path / "x.mp4", count=5)
+    one, two = read_frames(path, 24, threads=1), read_frames(path, 24, threads=2)
+    assert [frame.index for frame in one] == [0, 1, 2, 3, 4]
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "orientation", "red"),
+    [
+        (QUARTER_TURN_CLOCKWISE, 6, (0, -1)),
+        ((0, -1, 1, 0), 8, (-1, 0)),
+        ((-1, 0, 0, -1), 3, (-1, -1)),
+    ],
+)
+def test_display_matrix(
+    tmp_path: Path, matrix: tuple[int, int, int, int], orientation: int, red: tuple[int, int]
+) -> None:
+    path = film(tmp_path / "x.mp4", count=4)
+    turn_film(path, matrix)
+    assert {frame.orientation for frame in read_frames(path, 4)} == {orientation}
+    views, _ = run_stage(tmp_path / "out", path)
+    view = views.views[0]
+    assert (view.width, view.height) == ((160, 96) if orientation == 3 else (96, 160))
+    corner = view.image[red]
+    assert corner[0] > 0.8
+    assert corner[1] < 0.3
+    x, y, _ = view.working_from_source @ (0.5, 0.5, 1)
+    np.testing.assert_array_equal(view.image[int(y), int(x)], corner)
+
+
+def run_stage(folder: Path, path: Path, **settings: Any) -> tuple[Any, LocalContext]:
+    config = ViewsConfig(**settings)
+    sources = ViewsStage().sources(config, {"images": [path]})
+    context = LocalContext(config=config, folder=folder, sources=sources, threads=1)
+    ViewsStage().run(context)
+    return context.result("views"), context
+
+
+def test_stage_on_a_film(tmp_path: Path) -> None:
+    path = film(tmp_path / "my film.mp4")
+    views, _ = run_stage(tmp_path / "a", path)
+    assert len(views) == 24
+    assert views.ordered
+    views, context = run_stage(tmp_path / "b", path, frames=3, long_side=80, min_side=30)
+    assert [view.source_name for view in views.views] == [
+        "my film.mp4#0", "my film.mp4#14", "my film.mp4#29",
+    ]  # fmt: skip
+    assert [view.timestamp for view in views.views] == [0.0, 0.56, 1.16]
+    assert views.views[0].image.shape == (48, 80, 3)
+    assert views.views[0].source_size == (160, 96)
+    assert context.figures["views"] == 3
+
+
+def test_one_mask_for_the_film(tmp_path: Path) -> None:
+    path = film(tmp_path / "x.mp4", count=3)
+    (tmp_path / "masks").mkdir()
+    mask: npt.NDArray[np.uint8] = np.zeros((96, 160), np.uint8)
+    mask[:, 80:] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "x.png")
+    views, _ = run_stage(tmp_path / "out", path, masks=tmp_path / "masks")
+    for view in views.views:
+        np.testing.assert_array_equal(view.mask, mask > 0)
+
+
+def refused(folder: Path, path: Path) -> str:
+    with pytest.raises(RequestError) as caught:
+        run_stage(folder, path)
+    return str(caught.value)
+
+
+def test_broken_films(tmp_path: Path) -> None:
+    text = tmp_path / "text.mp4"
+    text.write_text("not a film\n" * 50)
+    assert "text.mp4 can't be read as a video" in refused(tmp_path / "a", text)
+    whole = film(tmp_path / "whole.mp4").read_bytes()
+    cut = tmp_path / "cut.mp4"  # the index lies at the end of the file, so nothing can be read
+    cut.write_bytes(whole[: len(whole) // 2])
+    assert "cut.mp4 can't be read as a video" in refused(tmp_path / "b", cut)
+    short = film(tmp_path / "short.mp4", count=1)
+    assert "short.mp4: one frame only" in refused(tmp_path / "c", short)
+    narrow = film(tmp_path / "narrow.mp4", count=3, size=(640, 48))
+    assert "640 x 48" in refused(tmp_path / "d", narrow)
+    sound = tmp_path / "sound.mp4"
+    with av.open(str(sound), "w") as container:
+        stream: Any = container.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(
+            np.zeros((1, 1024), np.float32), format="fltp", layout="mono"
+        )
+        frame.sample_rate = 44100
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert "no video in it" in refused(tmp_path / "e", sound)
+
+
+def test_a_film_that_breaks_off_gives_what_it_has(tmp_path: Path) -> None:
+    whole = film(tmp_path / "x.avi", codec="mpeg4").read_bytes()
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    frames = read_frames(cut, 3)
+    found = indices_by_brightness(frames)
+    assert len(found) == 3
+    assert found[0] == 0
+    assert 10 < found[-1] < 29
