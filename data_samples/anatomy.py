@@ -132,7 +132,7 @@ class ArchLine:
     """The line that the labial faces follow, by arc length from the midline."""
 
     def __init__(self, jaw: Jaw) -> None:
-        x = np.linspace(-jaw.half_width * 1.06, jaw.half_width * 1.06, 4001)
+        x = np.linspace(-jaw.half_width * 1.09, jaw.half_width * 1.09, 4001)
         z = -jaw.setback - jaw.depth * np.abs(x / jaw.half_width) ** 2.35
         length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
         self._along, self._x, self._z = length - length[len(x) // 2], x, z

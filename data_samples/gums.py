@@ -54,8 +54,15 @@ def grow_gum(jaw: Jaw, teeth: list[Tooth], random: np.random.Generator, step: fl
     """Drape a sheet over the roots: scalloped edge, papillae, root ridges, fold, lip."""
     line = ArchLine(jaw)
     along = np.arange(-line.reach, line.reach, step)
-    reach = np.arange(2.2, 36.0, step)  # from the occlusal plane towards the root
+    reach = np.arange(0.0, 36.0, step)  # from the occlusal plane towards the root
     margin = gum_margin(teeth, along, jaw.up)
+    # Behind the last molars the gum closes over the bite and runs into the cheek.
+    last = max(teeth, key=lambda tooth: tooth.along)
+    first = min(teeth, key=lambda tooth: tooth.along)
+    behind = np.maximum(
+        along - last.along - last.width / 2, first.along - first.width / 2 - along
+    )  # [S]
+    margin = margin - smoothstep(-0.3, 4.0, behind) * (margin + 2.0)
     depth = reach[None] - margin[:, None]  # [S, R]
 
     relief = tooth_relief(line, teeth, along, jaw.up * reach)
@@ -84,6 +91,8 @@ def grow_gum(jaw: Jaw, teeth: list[Tooth], random: np.random.Generator, step: fl
     # The fold, and beyond it the lip held away by a retractor; the frenum in the middle.
     lift = np.maximum(reach[None] - 16.5, 0) / 6
     offset = offset + 3.6 * lift**2 / (0.35 + lift) - 0.7 * smoothstep(9, 16, reach[None])
+    cheek = 0.16 * np.maximum(behind, 0)[:, None] ** 1.5
+    offset = offset + cheek * smoothstep(0.0, 14.0, reach[None])
     frenum = np.exp(-((along[:, None] / 1.3) ** 2)) * smoothstep(12, 19, reach[None])
     offset = offset + 1.5 * frenum
     for size, height in ((2.2, 0.28), (0.8, 0.05)):

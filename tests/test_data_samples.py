@@ -93,8 +93,8 @@ def test_depth_and_colour_of_neighbours_agree(case: str, step: int) -> None:
         there, here, carried, found = reproject(case, about, first, second)
         same = np.abs(carried - found) < 0.5
         # What one of the two does not see (behind a tooth, outside) can't agree; most of it must.
-        assert same.mean() > 0.75, (first["file_path"], second["file_path"])
-        assert np.median(np.abs(carried - found)[same]) < 0.1
+        assert same.mean() > 0.65, (first["file_path"], second["file_path"])
+        assert np.median(np.abs(carried - found)[same]) < 0.05  # a third of a degree would show
         colours = [
             cv2.resize(
                 cv2.cvtColor(cv2.imread(str(SAMPLES / case / f["file_path"])), cv2.COLOR_BGR2LAB),

@@ -15,6 +15,9 @@ from pipeline.artifacts.cameras import Camera
 
 Array = npt.NDArray[np.float32]
 
+#: Sum of the three channels by which views may differ in the colour of the same surface.
+_ALIKE = np.float32(0.3)
+
 
 @dataclass(frozen=True)
 class FusionOptions:
@@ -141,8 +144,8 @@ def _fuse_view(  # type: ignore[no-untyped-def]
             keep[y, x] = 2 if is_fill else 1
             depth_out[y, x] = np.float32(z if is_fill else mean / mass)
             residual_out[y, x] = np.float32(residual / agree if agree > 0 else -1)
-            # The weighted median by luma, the darker one of two: highlights move with the camera
-            # and are brighter than the surface, so they lose against any other view.
+            # Highlights move with the camera and are brighter than the surface: from the weighted
+            # median by luma (the darker one of two), take the mean of all that look like it.
             count = agree + 1
             order = np.argsort(lumas[:count])
             half = np.float32(0.5) * weights[:count].sum()
@@ -153,8 +156,14 @@ def _fuse_view(  # type: ignore[no-untyped-def]
                 if running >= half or k == (count - 1) // 2:
                     chosen = order[k]
                     break
-            for k in range(3):
-                color_out[y, x, k] = colors[chosen, k]
+            total = np.float32(0)
+            for k in range(count):
+                if abs(lumas[k] - lumas[chosen]) <= _ALIKE:
+                    total += weights[k]
+                    for q in range(3):
+                        color_out[y, x, q] += weights[k] * colors[k, q]
+            for q in range(3):
+                color_out[y, x, q] /= total
 
 
 def _camera_rows(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
@@ -272,7 +281,7 @@ def fuse(
             progress(v + 1, count)
     finally:
         numba.set_num_threads(before)
-    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+    positions, colors, normals, trust = (np.concatenate(a) for a in zip(*parts, strict=True))
     agreed = np.concatenate(residuals)
     residual_median = float(np.median(agreed)) if len(agreed) else float("nan")
-    return FusedCloud(*joined, fill=fill, residual=residual_median)
+    return FusedCloud(positions, colors, normals, trust, fill, residual_median)

@@ -190,8 +190,8 @@ def start_from_cameras(pairs: Sequence[PointmapPair], cameras: Mapping[str, Came
             pair_from.append(None)
             continue
         scale = _pair_scale(pair, cameras[pair.name_i], cameras[pair.name_j])
-        world_from_i = np.linalg.inv(cameras[pair.name_i].cam_from_world)
-        pair_from.append((scale, world_from_i[:3, :3], world_from_i[:3, 3]))
+        camera = cameras[pair.name_i]
+        pair_from.append((scale, camera.rotation.T, camera.centre))
     return Start(dict(cameras), pair_from)
 
 

@@ -35,10 +35,11 @@ def normalising_similarity(
         ahead = cameras[0].rotation[2] - (cameras[0].rotation[2] @ down) * down
     ahead = ahead / np.linalg.norm(ahead)
     rotation = np.stack([np.cross(down, ahead), down, ahead])
-    centre = np.median(np.asarray(points, np.float64), axis=0)
-    depth = np.median([camera.project(centre[None])[1][0] for camera in cameras])
+    # The median goes by axis, so it is taken along the new ones.
+    centre = np.median(np.asarray(points, np.float64) @ rotation.T, axis=0)
+    depth = np.median([camera.project(centre[None] @ rotation)[1][0] for camera in cameras])
     scale = 1.0 / max(float(abs(depth)), 1e-12)
-    return scale, rotation, -scale * rotation @ centre
+    return scale, rotation, -scale * centre
 
 
 def move_camera(camera: Camera, motion: tuple[float, Array, Array]) -> Camera:

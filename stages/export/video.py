@@ -42,7 +42,12 @@ def write_video(
         stream.pix_fmt = "yuv420p"
         stream.time_base = Fraction(1, fps)
         stream.thread_count = 1
-        stream.options = {"crf": str(crf), "preset": "medium", "threads": "1", "flags": "+bitexact"}
+        # x264's macroblock tree reads beyond the edge of its half-size pictures on CPUs with
+        # AVX-512: the bytes would change from run to run.
+        stream.options = {
+            "crf": str(crf), "preset": "medium", "threads": "1", "flags": "+bitexact",
+            "x264-params": "mbtree=0",
+        }  # fmt: skip
         context = stream.codec_context
         context.color_primaries = context.color_trc = context.colorspace = 1  # BT.709
         context.color_range = 1  # 16..235

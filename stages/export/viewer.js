@@ -157,8 +157,10 @@ class Viewer {
     }
   }
 
-  /** Sort and draw at once. */
+  /** Sort and draw at once, as things stand at this moment, at full resolution. */
   render() {
+    this.#advance(performance.now());
+    this.shown = 1;
     const pose = this.#currentPose();
     this.renderer.setOrder(backToFront(this.positions, depthAxis(pose)));
     this.renderer.draw(pose, this.backdrop);
@@ -236,7 +238,6 @@ class Viewer {
   }
 
   save() {
-    this.shown = 1;
     this.render();
     this.canvas.toBlob((blob) => {
       const link = document.createElement("a");

@@ -55,7 +55,7 @@ class Trust:
     consistency_relative: float = 0.0
     consistency_absolute: float = 0.25
     depth_tolerance: float = 0.02
-    min_texture: float = 0.0
+    min_texture: float = 2.0
     highlight_level: float = 1.0
 
 

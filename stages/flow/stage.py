@@ -48,9 +48,9 @@ class FlowConfig(StageConfig):
         1, ge=1, le=10, description="Pair each view with this many next ones in viewing order."
     )
     max_angle: float = Field(
-        30.0, ge=0, le=180,
+        45.0, ge=0, le=180,
         description="Widest angle between the views of a pair, degrees (where cameras are known). "
-        "Flow across wider angles is mostly wrong.",
+        "Without pre-warp, flow is mostly wrong from about 12 degrees on.",
     )  # fmt: skip
     consistency_relative: float = Field(
         0.0, ge=0, le=1,
@@ -66,7 +66,7 @@ class FlowConfig(StageConfig):
         description="Occlusion test: relative depth difference that is still the same surface.",
     )  # fmt: skip
     min_texture: float = Field(
-        0.0, ge=0, le=128,
+        2.0, ge=0, le=128,
         description="Trust flow only where the grey levels (0-255) of the 9x9 pixels around vary "
         "with at least this standard deviation; 0 switches the test off.",
     )  # fmt: skip
@@ -97,7 +97,7 @@ class FlowStage(Stage):
         import cv2
 
         threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)  # DIS cuts the image into one strip a thread, which shows in the bytes
+        cv2.setNumThreads(1)  # cheap insurance: the bytes must not depend on OpenCV's threads
         try:
             _run(context)
         finally:

@@ -11,7 +11,11 @@ from pathlib import Path
 import numpy as np
 
 #: Names that the function has in the OpenBLAS of numpy's wheels, and in a system's.
-_NAMES = ("scipy_openblas_{}_num_threads64_", "openblas_{}_num_threads64_", "openblas_{}_num_threads")
+_NAMES = (
+    "scipy_openblas_{}_num_threads64_",
+    "openblas_{}_num_threads64_",
+    "openblas_{}_num_threads",
+)
 
 
 @contextmanager

@@ -2,61 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from stages.init.blas import one_blas_thread
 from stages.init.features import Features, detect_features
-from stages.init.focal import better, search_focal
-from stages.init.geometry import (
-    Correspondences,
-    Lens,
-    Pair,
-    TwoView,
-    coherent_matches,
-    trusted_edges,
-    verify_pair,
-)
-from stages.init.mapping import MappingInput, Solution, map_views
+from stages.init.geometry import Correspondences, Lens, Pair, TwoView, coherent_matches
+from stages.init.mapping import MappingInput, Solution
 from stages.init.matching import candidate_pairs, match_features, overlap_counts, select_pairs
-
-Progress = Callable[[str, int, int], None]
-Result = TypeVar("Result")
-
-#: Pixel thresholds are given for images of this long side and scale with it.
-REFERENCE_SIDE = 512.0
-#: Coherence looks at neighbours this near (pixels at the reference size).
-COHERENCE_RADIUS = 40.0
-
-
-@dataclass(frozen=True)
-class ClassicalOptions:
-    """Settings of `reconstruct`; the stage's config describes each for users."""
-
-    squeezes: tuple[float, ...] = (1.0, 0.71, 0.5)
-    upright: bool = True
-    peak_threshold: float = 0.002
-    max_features: int = 6000
-    merge_radius: float = 1.2
-    match_ratio: float = 0.88
-    overlap_features: int = 800
-    overlap_matches: int = 80
-    pairs_per_view: int = 6
-    window: int = 4
-    max_error: float = 2.0
-    min_inliers: int = 25
-    min_coherence: float = 0.8
-    cycle_angle: float = 8.0
-    refine_focal: str = "auto"
-    mapper: str = "auto"
-    max_reprojection_error: float = 2.0
-    min_tri_angle: float = 1.0
+from stages.init.options import (
+    COHERENCE_RADIUS,
+    REFERENCE_SIDE,
+    VIEWS_PER_FREE_LENS,
+    ClassicalOptions,
+)
+from stages.init.parallel import in_threads
+from stages.init.solver import Progress, Solver, known_focal, unknown_focal
 
 
 @dataclass(frozen=True)
@@ -97,6 +62,7 @@ def reconstruct(
     grays: list[npt.NDArray[np.uint8]],
     valid: list[npt.NDArray[np.bool_]],
     focals: list[float | None],
+    focal_given: bool,
     ordered: bool,
     options: ClassicalOptions,
     *,
@@ -111,6 +77,7 @@ def reconstruct(
         grays: N images [H, W] uint8.
         valid: N masks [H, W]; outside there are no features.
         focals: N focal lengths in pixels, or None where unknown.
+        focal_given: they are known for sure, and not to be refined.
         ordered: the views are a sequence.
         threads: how many to use; doesn't change the result.
         scratch: folder for the mapper's files.
@@ -133,26 +100,26 @@ def reconstruct(
         matches={pair: len(found) for pair, found in correspondences.items()},
         displacement={pair: _displacement(found) for pair, found in correspondences.items()},
     )
-    solver = _Solver(given, options, pixel, seed, threads, scratch)
+    solver = Solver(given, options, pixel, seed, threads, scratch)
+    free = options.refine_focal == "always" or (
+        options.refine_focal == "auto"
+        and not focal_given
+        and len(grays) >= VIEWS_PER_FREE_LENS * len(lenses)
+    )
     known = all(lens.focal for lens in lenses)
-    count = len(grays)
-    free = options.refine_focal == "always" or (options.refine_focal == "auto" and count >= 6)
-    determined = known
     if known:
-        progress("reconstruct", 0, 1)
-        best = solver.solve([float(lens.focal or 0) for lens in lenses], free)
+        best, determined = known_focal(solver, free, progress), True
     else:
-        best, determined = _unknown_focal(solver, count, free, progress)
+        best, determined = unknown_focal(solver, free, progress)
     if best is not None:
         best = solver.with_other_mapper(best, free)
     progress("reconstruct", 1, 1)
     return Attempt(
         solution=best,
-        evidence=Evidence(evidence.keypoints, evidence.matches, evidence.displacement,
-                          solver.edges_used(best)),
+        evidence=replace(evidence, edges=solver.edges_used(best)),
         focal_known=known,
         focal_determined=determined,
-    )  # fmt: skip
+    )
 
 
 def group_lenses(
@@ -193,7 +160,7 @@ def _features(
             merge_radius=options.merge_radius,
         )  # fmt: skip
 
-    return _in_threads(
+    return in_threads(
         detect, range(len(grays)), threads, lambda done: progress("features", done, len(grays))
     )
 
@@ -228,7 +195,7 @@ def _correspondences(
         return Correspondences(found, positions_i, positions_j, coherent)
 
     with one_blas_thread():
-        found = _in_threads(
+        found = in_threads(
             match, pairs, threads, lambda done: progress("matching", done, len(pairs))
         )
     return dict(zip(pairs, found, strict=True))
@@ -237,142 +204,3 @@ def _correspondences(
 def _displacement(found: Correspondences) -> float:
     moved = (found.positions_j - found.positions_i)[found.coherent]
     return float(np.median(np.linalg.norm(moved, axis=1))) if len(moved) else float("inf")
-
-
-def _unknown_focal(
-    solver: _Solver, count: int, free: bool, progress: Progress
-) -> tuple[Solution | None, bool]:
-    """Free bundle adjustment where it can be trusted, else a search over fixed focal lengths."""
-    if free:
-        progress("reconstruct", 0, 3)
-        first = solver.solve_ratio(1.2, True)
-        progress("reconstruct", 1, 3)
-        if first is not None and len(first.poses) == count and solver.sane(first):
-            # Once more with pairs verified at the focal length found.
-            again = solver.solve(solver.focals_of(first), True)
-            return better(first, again) if again else first, True
-    done = 0
-
-    def solve(ratio: float) -> Solution | None:
-        nonlocal done
-        solution = solver.solve_ratio(ratio, False)
-        done += 1
-        progress("focal length", min(done, 9), 9)
-        return solution
-
-    result = search_focal(solve)
-    if result is None:
-        return None, False
-    best: Solution | None = result.solution
-    if free and best is not None:
-        freed = solver.solve(solver.focals_of(best), True)
-        if freed is not None and solver.sane(freed):
-            return better(best, freed), True
-    return best, result.determined
-
-
-class _Solver:
-    """Verifies pairs and maps views at a given focal length; matches stay the same."""
-
-    def __init__(
-        self, given: MappingInput, options: ClassicalOptions, pixel: float, seed: int,
-        threads: int, scratch: Path,
-    ) -> None:  # fmt: skip
-        self.given = given
-        self.options = options
-        self.pixel = pixel
-        self.seed = seed
-        self.threads = threads
-        self.scratch = scratch
-        self._verified: dict[tuple[float, ...], dict[Pair, TwoView]] = {}
-        self._last: dict[Pair, TwoView] = {}
-
-    def solve_ratio(self, ratio: float, free: bool) -> Solution | None:
-        return self.solve([ratio * lens.long_side for lens in self.given.lenses], free)
-
-    def solve(self, focals: list[float], free: bool, mapper: str | None = None) -> Solution | None:
-        """Verify all pairs at these focal lengths (pixels, one per lens), choose, and map."""
-        edges = self._edges(focals)
-        self._last = edges
-        kept = trusted_edges(
-            edges, len(self.given.positions),
-            min_inliers=self.options.min_inliers, tree_coherence=self.options.min_coherence,
-            cycle_angle=self.options.cycle_angle,
-        )  # fmt: skip
-        chosen = mapper or ("global" if self.options.mapper == "global" else "incremental")
-        solution = map_views(
-            self.given, {pair: edges[pair] for pair in kept}, focals,
-            refine_focal=free, method=chosen,
-            max_error=self.options.max_reprojection_error * self.pixel,
-            min_tri_angle=self.options.min_tri_angle, seed=self.seed, scratch=self.scratch,
-        )  # fmt: skip
-        return solution if solution is not None and len(solution.poses) >= 2 else None
-
-    def with_other_mapper(self, best: Solution, free: bool) -> Solution | None:
-        """Try the global mapper where the incremental one left views out."""
-        if self.options.mapper != "auto" or len(best.poses) == len(self.given.positions):
-            return best
-        other = self.solve(self.focals_of(best), free, "global")
-        if other is None or len(other.poses) <= len(best.poses) or not self.sane(other):
-            return best
-        return other
-
-    def sane(self, solution: Solution) -> bool:
-        """Is the focal length one that a camera has, and the error small?"""
-        ratios = [
-            focal / self.given.lenses[self.given.lens_of_view[view]].long_side
-            for view, focal in solution.focals.items()
-        ]
-        return (
-            all(0.3 < ratio < 5 for ratio in ratios)
-            and solution.error < self.options.max_reprojection_error * self.pixel
-        )
-
-    def focals_of(self, solution: Solution) -> list[float]:
-        """Focal length in pixels of each lens; of one that no placed view has, by the others'."""
-        lenses, lens_of_view = self.given.lenses, self.given.lens_of_view
-        found = {lens_of_view[view]: focal for view, focal in solution.focals.items()}
-        usual = float(np.median([focal / lenses[k].long_side for k, focal in found.items()]))
-        return [found.get(k, usual * lens.long_side) for k, lens in enumerate(lenses)]
-
-    def edges_used(self, solution: Solution | None) -> dict[Pair, TwoView]:
-        """The two-view geometries at the focal length of a solution, or those tried last."""
-        return self._last if solution is None else self._edges(self.focals_of(solution))
-
-    def _edges(self, focals: list[float]) -> dict[Pair, TwoView]:
-        key = tuple(round(focal, 3) for focal in focals)
-        if key not in self._verified:
-            given = self.given
-            cameras = [lens.camera(focal) for lens, focal in zip(given.lenses, focals, strict=True)]
-
-            def verify(pair: Pair) -> TwoView | None:
-                return verify_pair(
-                    given.correspondences[pair],
-                    cameras[given.lens_of_view[pair[0]]],
-                    cameras[given.lens_of_view[pair[1]]],
-                    max_error=self.options.max_error * self.pixel,
-                    coherence_radius=COHERENCE_RADIUS * self.pixel,
-                    seed=self.seed,
-                )
-
-            pairs = sorted(given.correspondences)
-            found = _in_threads(verify, pairs, self.threads)
-            self._verified[key] = {
-                pair: edge for pair, edge in zip(pairs, found, strict=True) if edge is not None
-            }
-        return self._verified[key]
-
-
-def _in_threads(
-    function: Callable[[Any], Result],
-    items: Iterable[Any],
-    threads: int,
-    progress: Callable[[int], None] = lambda done: None,
-) -> list[Result]:
-    """Map in threads; results come in the order of the items, so that threads change nothing."""
-    results = []
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for result in pool.map(function, items):
-            results.append(result)
-            progress(len(results))
-    return results

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.init.classical import Attempt, Evidence
-from stages.init.geometry import Pair
+from stages.init.geometry import Pair, angle_between
 from stages.init.mapping import Solution
 
 #: Advice that helps in nearly all cases.
@@ -24,7 +24,6 @@ class Limits:
 
     Attributes:
         min_views: least number of views.
-        min_coherence: least coherence of a pair that links views.
         min_tri_angle: degrees, of the median point.
         min_baseline: largest distance between two cameras over the median depth.
         min_points: points that each view must observe.
@@ -33,7 +32,6 @@ class Limits:
     """
 
     min_views: int
-    min_coherence: float
     max_error: float
     min_tri_angle: float = 1.5
     min_baseline: float = 0.02
@@ -71,7 +69,7 @@ def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
-            f"{_weakest_link(evidence, names, set(), limits)} {_advice(attempt)}"
+            f"{_weakest_link(evidence, names, set())} {_advice(attempt)}"
         )
     doubt = doubtful(solution, evidence, limits)
     if doubt:
@@ -81,14 +79,14 @@ def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
         return (
             f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
             f"{limits.min_views} are needed. Not placed: {_listed(unplaced)}. "
-            f"{_weakest_link(evidence, names, set(solution.poses), limits)} {_advice(attempt)}"
+            f"{_weakest_link(evidence, names, set(solution.poses))} {_advice(attempt)}"
         )
     return None
 
 
 def standing_still(evidence: Evidence, count: int) -> str | None:
     """The diagnosis if no pair of photographs shows any movement, else None."""
-    strong = [pair for pair, edge in evidence.edges.items() if edge.weight >= 25]
+    strong = [pair for pair, edge in evidence.edges.items() if edge.evidence >= 25]
     if not strong:
         return None
     linked = {view for pair in strong for view in pair}
@@ -129,8 +127,6 @@ def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | No
 
 
 def _turn(solution: Solution, pair: Pair, evidence: Evidence) -> float:
-    from stages.init.geometry import angle_between
-
     i, j = pair
     turn = solution.poses[j][:3, :3] @ solution.poses[i][:3, :3].T
     return angle_between(turn, evidence.edges[pair].rotation)
@@ -141,7 +137,7 @@ def _median_depth(solution: Solution) -> float:
     return float(np.median(np.concatenate(depths))) if depths else 0.0
 
 
-def _weakest_link(evidence: Evidence, names: list[str], placed: set[int], limits: Limits) -> str:
+def _weakest_link(evidence: Evidence, names: list[str], placed: set[int]) -> str:
     """Name the pair that should link the unplaced photographs with the rest, and what it lacks."""
     missing = [pair for pair in evidence.matches if not placed or len({*pair} & placed) == 1]
     if not missing:
@@ -149,7 +145,7 @@ def _weakest_link(evidence: Evidence, names: list[str], placed: set[int], limits
 
     def strength(pair: Pair) -> tuple[float, int]:
         edge = evidence.edges.get(pair)
-        return (edge.weight if edge else 0.0, evidence.matches[pair])
+        return (edge.evidence if edge else 0.0, evidence.matches[pair])
 
     pair = min(missing, key=lambda pair: (tuple(-value for value in strength(pair)), pair))
     first, second = names[pair[0]], names[pair[1]]

@@ -85,9 +85,13 @@ class TwoView:
     j_from_i: Array
 
     @property
-    def weight(self) -> float:
-        """Coherent inliers: how much the pair can be believed."""
-        return len(self.inliers) * self.coherence
+    def evidence(self) -> float:
+        """How much the pair can be believed: coherent inliers times coherence squared.
+
+        Of 215 pairs of dental frames 40 degrees and more apart, those more than 6 degrees wrong
+        had at most 56, while right ones 35 degrees apart had from 73 on.
+        """
+        return len(self.inliers) * self.coherence**2
 
     @property
     def rotation(self) -> Array:
@@ -234,21 +238,21 @@ def trusted_edges(
     edges: dict[Pair, TwoView],
     view_count: int,
     *,
+    min_evidence: float = 65.0,
     min_inliers: int = 25,
-    tree_coherence: float = 0.8,
     cycle_coherence: float = 0.5,
     cycle_angle: float = 8.0,
 ) -> list[Pair]:
     """Choose the pairs to reconstruct from, sorted.
 
-    A maximum spanning forest over weight, of pairs that are coherent; any other pair only if the
-    rotation around the cycle that it closes is right within `cycle_angle` degrees.
+    A maximum spanning forest of pairs with enough evidence; any other pair only if the rotation
+    around the cycle that it closes is right within `cycle_angle` degrees.
     """
     enough = {pair: edge for pair, edge in edges.items() if len(edge.inliers) >= min_inliers}
-    coherent = {
-        pair: edge.weight for pair, edge in enough.items() if edge.coherence >= tree_coherence
+    believed = {
+        pair: edge.evidence for pair, edge in enough.items() if edge.evidence >= min_evidence
     }
-    tree = spanning_tree(coherent, view_count)
+    tree = spanning_tree(believed, view_count)
     kept = set(tree)
     placed: set[int] = set()
     for view in range(view_count):

@@ -50,7 +50,8 @@ class InitConfig(StageConfig):
         "36); overrides EXIF; null: EXIF, else searched",
     )  # fmt: skip
     refine_focal: Literal["auto", "always", "never"] = Field(
-        "auto", description="free the focal length in bundle adjustment; auto: from 6 views on"
+        "auto",
+        description="free the focal length in bundle adjustment; auto: from 3 views, if not given",
     )
     min_views_fraction: float = Field(
         0.5, ge=0, le=1, description="share of the views that must be placed (of 3: all)"
@@ -70,9 +71,10 @@ class InitConfig(StageConfig):
     window: int = Field(4, ge=1, le=1000, description="neighbours in a video that are tried")
     max_error: float = Field(2.0, gt=0, le=50, description="epipolar error, px at 512 px width")
     min_inliers: int = Field(25, ge=8, le=10_000, description="least agreeing matches of a pair")
-    min_coherence: float = Field(
-        0.8, ge=0, le=1, description="least share of agreeing matches that move together"
-    )
+    min_evidence: float = Field(
+        65, ge=1, description="agreeing matches times the square of the share that moves together, "
+        "which a pair needs to link photographs; lower risks wrong scenes",
+    )  # fmt: skip
     cycle_angle: float = Field(8.0, gt=0, le=180, description="rotation error around a cycle, deg")
     mapper: Literal["auto", "incremental", "global"] = Field(
         "auto", description="COLMAP's mapper; auto: incremental, global where views are left out"
@@ -88,7 +90,7 @@ class InitConfig(StageConfig):
     min_dense_points: int = Field(
         5000, ge=0, description="with fewer dense points the sparse ones are added"
     )
-    dense: DenseConfig = Field(DenseConfig(), description="dense stereo")
+    dense: DenseConfig = Field(DenseConfig.model_validate({}), description="dense stereo")
 
 
 class InitStage(Stage):
@@ -112,8 +114,9 @@ class InitStage(Stage):
         Raises:
             ReconstructionError: the photographs don't allow it; the message says why.
         """
-        from stages.init.classical import ClassicalOptions, reconstruct
+        from stages.init.classical import reconstruct
         from stages.init.diagnosis import Limits, failure, least_views
+        from stages.init.options import ClassicalOptions
 
         config: InitConfig = context.config
         views: Views = context.load("views")
@@ -127,13 +130,13 @@ class InitStage(Stage):
         names = [view.source_name or view.name for view in views.views]
         limits = Limits(
             min_views=least_views(len(views), config.min_views_fraction),
-            min_coherence=config.min_coherence,
             max_error=config.max_reprojection_error * _pixel(views),
         )
         attempt = reconstruct(
             [view.gray() for view in views.views],
             [view.valid() for view in views.views],
             focals,
+            config.focal is not None,
             views.ordered,
             options,
             seed=context.seed,
@@ -214,7 +217,7 @@ def _densify(context: StageContext, views: Views, attempt: Any) -> None:
 
     index_of = {view: number for number, view in enumerate(order)}
     weights = {
-        (index_of[i], index_of[j]): edge.weight
+        (index_of[i], index_of[j]): edge.evidence
         for (i, j), edge in attempt.evidence.edges.items()
         if (i, j) in solution.edges and i in index_of and j in index_of
     }
@@ -243,6 +246,6 @@ def _densify(context: StageContext, views: Views, attempt: Any) -> None:
 
 def _pixel(views: Views) -> float:
     """Size of the working images relative to what pixel thresholds are given for."""
-    from stages.init.classical import REFERENCE_SIDE
+    from stages.init.options import REFERENCE_SIDE
 
     return max(max(view.width, view.height) for view in views.views) / REFERENCE_SIDE

@@ -72,7 +72,7 @@ class SapStage(Stage):
         config: SapConfig = context.config
         points: Points = context.load("points")
         cloud = Cloud(points.positions, points.colors, points.normals, points.confidence)
-        finite = np.isfinite(cloud.positions).all(axis=1)
+        finite = np.asarray(np.isfinite(cloud.positions).all(axis=1))
         if not finite.any():
             raise ReconstructionError(
                 "The point cloud is empty: no part of the scene was seen well enough by two "

@@ -88,10 +88,10 @@ def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
             )
         return {videos[0].name: videos[0]}
     if len(paths) < 2:
-        what = f"only one photograph was ({paths[0].name})" if paths else "no photograph was"
+        what = f"only {paths[0].name} was named" if paths else "none was named"
         raise RequestError(
-            f"A 3D scene needs at least two photographs from different sides, better three or "
-            f"more; {what} named. Name a folder of photographs, several files, or a video."
+            "A 3D scene needs at least two photographs from different sides, better three or more; "
+            f"{what}. Name a folder of photographs, several files, or a video."
         )
     labels = _labels(paths)
     return {label: labels[label] for label in sorted(labels, key=natural_key)}

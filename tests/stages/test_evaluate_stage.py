@@ -161,3 +161,23 @@ def test_empty_masks_are_left_out_or_explained(tmp_path: Path) -> None:
     assert "001" in run.warnings[0]
     with pytest.raises(RequestError, match="masks"):
         evaluate(context(tmp_path / "b", Views((empty,)), ["001"]), Darker(views))
+
+
+def test_with_the_real_renderer(tmp_path: Path) -> None:
+    """One broad opaque Gaussian before a small camera: its colour in the middle of the picture."""
+    sh = np.zeros((1, 16, 3), np.float32)
+    sh[0, 0] = (np.array([0.8, 0.4, 0.2]) - 0.5) / 0.28209479177387814
+    gaussians = Gaussians(
+        np.array([[0, 0, 4]], np.float32), np.array([[1, 0, 0, 0]], np.float32),
+        np.full((1, 3), np.log(2.0), np.float32), np.full(1, 12, np.float32), sh,
+    )  # fmt: skip
+    photo = np.broadcast_to(np.array([0.8, 0.4, 0.2], np.float32), (32, 48, 3)).copy()
+    mask = np.zeros((32, 48), bool)
+    mask[14:18, 22:26] = True  # where the Gaussian is opaque
+    views = Views((View("000", photo, mask),))
+    run = context(tmp_path, views, ["000"])
+    run.inputs = {**run.inputs, "gaussians": gaussians}
+    EvaluateStage().run(run)
+    figures = run.result("metrics").figures
+    assert figures["views"]["000"]["psnr"] > 38
+    assert figures["coverage"] == 1

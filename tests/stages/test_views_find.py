@@ -26,8 +26,26 @@ def touch(folder: Path, *names: str) -> list[Path]:
 
 
 def test_natural_order() -> None:
-    names = ["img10.png", "img2.png", "IMG1.png", "a.png", "7.png", "img2b.png", "007.png"]
-    ordered = ["007.png", "7.png", "a.png", "IMG1.png", "img2.png", "img2b.png", "img10.png"]
+    names = [
+        "img10.png",
+        "img2.png",
+        "IMG1.png",
+        "a.png",
+        "7.png",
+        "img2b.png",
+        "007.png",
+        "img.png",
+    ]
+    ordered = [
+        "007.png",
+        "7.png",
+        "a.png",
+        "img.png",
+        "IMG1.png",
+        "img2.png",
+        "img2b.png",
+        "img10.png",
+    ]
     assert sorted(names, key=natural_key) == ordered
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -258,3 +260,9 @@ def test_gps_of_real_photographs_is_not_carried_on(tmp_path: Path) -> None:
         assert view.focal_px is not None
         assert 0.75 < view.focal_px / max(view.width, view.height) < 1.05
     assert "berlin" not in json.dumps([view.source_name for view in views.views])
+
+
+def test_naming_the_stage_loads_no_heavy_library() -> None:
+    code = "import sys, stages.views.stage; print(sorted({'cv2', 'PIL', 'av'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -4,7 +4,22 @@ Plane sweep with ZNCC, semi-global aggregation, geometric consistency between th
 low-confidence completion where stereo knows nothing. Bytes do not depend on the thread count.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from stages.init.dense.options import DenseOptions, DenseView
-from stages.init.dense.reconstruct import dense_depths
+
+if TYPE_CHECKING:
+    from stages.init.dense.reconstruct import dense_depths
 
 __all__ = ["DenseOptions", "DenseView", "dense_depths"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the kernels when they are asked for: the options alone cost nothing."""
+    if name == "dense_depths":
+        from stages.init.dense.reconstruct import dense_depths
+
+        return dense_depths
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -269,7 +269,7 @@ def _fill(
     depth = stack[index, :height, :width]
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
-    far = 0.9 * float(np.percentile(inverse[known], 1))
+    far = 0.85 * float(np.percentile(inverse[known], 1))
     weight = np.where(known, np.minimum(confidence - 1, 5), 0).astype(np.float32)
     smooth = complete(inverse, weight, gray, far, options.fill_reach_px)
     result = depth.copy()

@@ -1,0 +1,197 @@
+"""From matches to a reconstruction, for focal lengths that are known, to be refined, or unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from stages.init.focal import better, search_focal
+from stages.init.geometry import Pair, TwoView, trusted_edges, verify_pair
+from stages.init.mapping import MappingInput, Solution, map_views
+from stages.init.options import COHERENCE_RADIUS, ClassicalOptions
+from stages.init.parallel import in_threads
+
+Progress = Callable[[str, int, int], None]
+
+#: Focal lengths over the long side that bundle adjustment starts from.
+STARTS = (1.2, 2.0)
+#: Two starts that end further apart than this (relative) don't determine the focal length.
+SAME_FOCAL = 0.05
+#: EXIF is believed rather than a result that is further off than this (relative).
+EXIF_TOLERANCE = 0.15
+#: From this many views on one start does.
+MANY_VIEWS = 6
+
+
+class Solver:
+    """Verifies pairs and maps views at a given focal length; the matches stay the same.
+
+    Args:
+        given: lenses, keypoints and matches.
+        pixel: size of the images relative to `REFERENCE_SIDE`.
+        scratch: folder for the mapper's files.
+    """
+
+    def __init__(
+        self, given: MappingInput, options: ClassicalOptions, pixel: float, seed: int,
+        threads: int, scratch: Path,
+    ) -> None:  # fmt: skip
+        self.given = given
+        self.options = options
+        self.pixel = pixel
+        self.seed = seed
+        self.threads = threads
+        self.scratch = scratch
+        self.view_count = len(given.positions)
+        self._verified: dict[tuple[float, ...], dict[Pair, TwoView]] = {}
+        self._last: dict[Pair, TwoView] = {}
+
+    def solve_ratio(self, ratio: float, free: bool) -> Solution | None:
+        """`solve` with one focal length, over the long side, for all lenses."""
+        return self.solve([ratio * lens.long_side for lens in self.given.lenses], free)
+
+    def solve(self, focals: list[float], free: bool, mapper: str | None = None) -> Solution | None:
+        """Verify all pairs at these focal lengths (pixels, one per lens), choose pairs, and map."""
+        options = self.options
+        edges = self._last = self._edges(focals)
+        kept = trusted_edges(
+            edges, self.view_count,
+            min_evidence=options.min_evidence, min_inliers=options.min_inliers,
+            cycle_angle=options.cycle_angle,
+        )  # fmt: skip
+        solution = map_views(
+            self.given, {pair: edges[pair] for pair in kept}, focals,
+            refine_focal=free,
+            method=mapper or ("global" if options.mapper == "global" else "incremental"),
+            max_error=options.max_reprojection_error * self.pixel,
+            min_tri_angle=options.min_tri_angle, seed=self.seed, scratch=self.scratch,
+        )  # fmt: skip
+        return solution if solution is not None and len(solution.poses) >= 2 else None
+
+    def with_other_mapper(self, best: Solution, free: bool) -> Solution:
+        """Try the global mapper where the incremental one left views out."""
+        if self.options.mapper != "auto" or self.complete(best):
+            return best
+        other = self.solve(self.focals_of(best), free, "global")
+        if other is None or len(other.poses) <= len(best.poses) or not self.sane(other):
+            return best
+        return other
+
+    def complete(self, solution: Solution) -> bool:
+        """Are all views placed?"""
+        return len(solution.poses) == self.view_count
+
+    def sane(self, solution: Solution) -> bool:
+        """Is the focal length one that a camera has, and the error small?"""
+        ratios = [
+            focal / self.given.lenses[self.given.lens_of_view[view]].long_side
+            for view, focal in solution.focals.items()
+        ]
+        return (
+            all(0.3 < ratio < 5 for ratio in ratios)
+            and solution.error < self.options.max_reprojection_error * self.pixel
+        )
+
+    def focals_of(self, solution: Solution) -> list[float]:
+        """Focal length in pixels of each lens; of one that no placed view has, by the others'."""
+        lenses, lens_of_view = self.given.lenses, self.given.lens_of_view
+        found = {lens_of_view[view]: focal for view, focal in solution.focals.items()}
+        usual = float(np.median([focal / lenses[k].long_side for k, focal in found.items()]))
+        return [found.get(k, usual * lens.long_side) for k, lens in enumerate(lenses)]
+
+    def edges_used(self, solution: Solution | None) -> dict[Pair, TwoView]:
+        """The two-view geometries at the focal length of a solution, or those tried last."""
+        return self._last if solution is None else self._edges(self.focals_of(solution))
+
+    def _edges(self, focals: list[float]) -> dict[Pair, TwoView]:
+        key = tuple(round(focal, 3) for focal in focals)
+        if key not in self._verified:
+            given = self.given
+            cameras = [lens.camera(focal) for lens, focal in zip(given.lenses, focals, strict=True)]
+
+            def verify(pair: Pair) -> TwoView | None:
+                return verify_pair(
+                    given.correspondences[pair],
+                    cameras[given.lens_of_view[pair[0]]],
+                    cameras[given.lens_of_view[pair[1]]],
+                    max_error=self.options.max_error * self.pixel,
+                    coherence_radius=COHERENCE_RADIUS * self.pixel,
+                    seed=self.seed,
+                )
+
+            pairs = sorted(given.correspondences)
+            found = in_threads(verify, pairs, self.threads)
+            self._verified[key] = {
+                pair: edge for pair, edge in zip(pairs, found, strict=True) if edge is not None
+            }
+        return self._verified[key]
+
+
+def known_focal(solver: Solver, free: bool, progress: Progress) -> Solution | None:
+    """Reconstruct with the lenses' focal lengths; refined, if the result stays near them."""
+    focals = [float(lens.focal or 0) for lens in solver.given.lenses]
+    progress("reconstruct", 0, 2)
+    if not free:
+        return solver.solve(focals, False)
+    refined = solver.solve(focals, True)
+    progress("reconstruct", 1, 2)
+    if refined is not None and solver.complete(refined) and solver.sane(refined):
+        drift = [
+            abs(found / focal - 1)
+            for found, focal in zip(solver.focals_of(refined), focals, strict=True)
+        ]
+        if max(drift) < EXIF_TOLERANCE:
+            return refined
+    fixed = solver.solve(focals, False)
+    return better(fixed, refined) if refined is not None and solver.sane(refined) else fixed
+
+
+def unknown_focal(solver: Solver, free: bool, progress: Progress) -> tuple[Solution | None, bool]:
+    """Reconstruct without knowing the focal length.
+
+    Bundle adjustment finds it from several starts; where that fails, or there are too few views
+    for it (`free` is False), fixed focal lengths are searched.
+
+    Returns:
+        The reconstruction, and whether the photographs determine the focal length.
+    """
+    many = solver.view_count >= MANY_VIEWS
+    if free:
+        found, determined = _freed(solver, many, progress)
+        if found is not None and (many or solver.complete(found)):
+            return found, determined
+    tried = 0
+
+    def solve(ratio: float) -> Solution | None:
+        nonlocal tried
+        solution = solver.solve_ratio(ratio, False)
+        tried += 1
+        progress("focal length", min(tried, 9), 9)
+        return solution
+
+    result = search_focal(solve)
+    return (result.solution, result.determined) if result else (None, False)
+
+
+def _freed(solver: Solver, many: bool, progress: Progress) -> tuple[Solution | None, bool]:
+    """The best of the free reconstructions from `STARTS`, and whether they agree."""
+    best: Solution | None = None
+    ends: list[float] = []
+    for number, start in enumerate(STARTS):
+        progress("reconstruct", number, len(STARTS) + 1)
+        solution = solver.solve_ratio(start, True)
+        if solution is not None and solver.sane(solution):
+            best = better(best, solution)
+            ends.append(float(np.median(list(solution.focals.values()))))
+            if many and solver.complete(solution):
+                return solution, True
+    if best is None:
+        return None, False
+    # Once more, with the pairs verified at the focal length found: they gain matches.
+    again = solver.solve(solver.focals_of(best), True)
+    if again is not None and solver.sane(again) and len(again.poses) >= len(best.poses):
+        best = again
+    agree = len(ends) == len(STARTS) and max(ends) / min(ends) - 1 < SAME_FOCAL
+    return best, agree and solver.complete(best)

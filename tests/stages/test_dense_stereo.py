@@ -1,0 +1,251 @@
+"""Dense stereo on a rendered scene with exact depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.init.dense import DenseOptions, DenseView, dense_depths
+from stages.init.dense.appearance import highlights, normals_from_depth
+from stages.init.dense.sources import inverse_depth_range, scene_points, select_sources
+
+_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
+assert _spec is not None and _spec.loader is not None
+_scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(_scene)
+camera, render, scene = _scene.camera, _scene.render, _scene.scene
+
+# On so small an image depth changes four times as fast from pixel to pixel: smaller penalties.
+OPTIONS = DenseOptions(planes=48, max_planes=48, speckle=10, p1=0.02, p2=0.5)
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "scan_video_a"
+
+
+def everywhere(images: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.ones(image.shape[:2], bool) for image in images]
+
+
+def relative_error(found: DenseView, truth: np.ndarray) -> np.ndarray:
+    known = found.depth > 0
+    return np.abs(found.depth - truth)[known] / truth[known]
+
+
+def same(a: list[DenseView], b: list[DenseView]) -> bool:
+    fields = ("depth", "confidence", "normal", "filled", "agreeing")
+    return all(
+        getattr(x, name).tobytes() == getattr(y, name).tobytes()
+        for x, y in zip(a, b, strict=True)
+        for name in fields
+    )
+
+
+@pytest.fixture(scope="module")
+def three():
+    cameras, images, depths, sparse = scene((-9.0, 0.0, 9.0))
+    calls: list[tuple[int, int]] = []
+    found = dense_depths(
+        images, everywhere(images), cameras, sparse, OPTIONS, 2, lambda *step: calls.append(step)
+    )
+    return cameras, images, depths, sparse, found, calls
+
+
+def test_depth_is_right_and_most_of_it_is_there(three):
+    _, _, depths, _, found, calls = three
+    for view, truth in zip(found, depths, strict=True):
+        error = relative_error(view, truth)
+        assert (view.depth > 0).mean() > 0.55
+        assert np.median(error) < 0.003
+        assert np.percentile(error, 95) < 0.03
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_confidence_is_one_only_where_nothing_is_known_and_higher_where_depth_is_better(three):
+    _, _, depths, _, found, _ = three
+    error = np.concatenate([relative_error(v, t) for v, t in zip(found, depths, strict=True)])
+    trust = np.concatenate([v.confidence[v.depth > 0] for v in found])
+    for view in found:
+        guessed = (view.depth == 0) & (view.filled > 0)
+        assert (view.confidence >= 1).all()
+        assert (view.confidence[view.filled == 0] == 1).all()
+        assert ((view.confidence[guessed] > 1) & (view.confidence[guessed] <= 1.21)).all()
+        assert (view.confidence[view.depth > 0] > 1.25).all()
+    low, high = trust < np.quantile(trust, 0.2), trust > np.quantile(trust, 0.8)
+    assert np.percentile(error[high], 90) < np.percentile(error[low], 90)
+
+
+def test_fill_agrees_with_depth_and_never_stands_before_another_view_s_surface(three):
+    cameras, _, _, _, found, _ = three
+    for k, view in enumerate(found):
+        known = view.depth > 0
+        assert np.array_equal(view.filled[known], view.depth[known])
+        guessed = ~known & (view.filled > 0)
+        assert guessed.any()
+        points = cameras[k].unproject(view.filled)[guessed]
+        for other, lens in zip(found, cameras, strict=True):
+            pixels, depth = lens.project(points)
+            cell = np.floor(pixels).astype(int)
+            inside = ((cell >= 0) & (cell < (lens.width, lens.height))).all(1)
+            seen = other.depth[cell[inside, 1], cell[inside, 0]]
+            assert not ((seen > 0) & (depth[inside] < seen * 0.979)).any()
+
+
+def test_normals_of_the_ball(three):
+    cameras, _, depths, _, found, _ = three
+    points = cameras[1].unproject(depths[1])
+    outward = points - np.array([0.0, 0.0, 3.6])
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    centre = np.zeros(depths[1].shape, bool)
+    centre[38:58, 52:76] = True
+    centre &= found[1].depth > 0
+    cosine = (found[1].normal * outward).sum(-1)[centre]
+    assert np.median(cosine) > 0.95
+    exact = normals_from_depth(depths[1], np.ones_like(depths[1]), cameras[1], 1.0)
+    assert np.median((exact * outward).sum(-1)[38:58, 52:76]) > 0.995
+
+
+def test_any_thread_count_gives_the_same_bytes(three):
+    cameras, images, _, sparse, found, _ = three
+    alone = dense_depths(images, everywhere(images), cameras, sparse, OPTIONS, 1)
+    assert same(alone, found)
+
+
+def test_masked_pixels_get_nothing_and_are_not_used(three):
+    cameras, images, depths, sparse, _, _ = three
+    valid = everywhere(images)
+    for mask in valid:
+        mask[:, :40] = False
+    spoiled = [image.copy() for image in images]
+    for image in spoiled:
+        image[:, :40] = np.random.default_rng(0).random((96, 40, 3), np.float32)
+    found = dense_depths(spoiled, valid, cameras, sparse, OPTIONS, 2)
+    clean = dense_depths(images, valid, cameras, sparse, OPTIONS, 2)
+    for view, untouched, truth in zip(found, clean, depths, strict=True):
+        assert (view.depth[:, :40] == 0).all()
+        assert (view.filled[:, :40] == 0).all()
+        assert (view.confidence[:, :40] == 1).all()
+        assert np.median(relative_error(view, truth)) < 0.003
+        # What is masked must not reach what is not, but for the penalty at the mask's edge.
+        assert np.mean(view.depth[:, 44:] != untouched.depth[:, 44:]) < 0.2
+
+
+def test_views_of_different_size():
+    cameras, images, depths, sparse = scene((-9.0, 0.0, 9.0), ((128, 96), (112, 84), (96, 110)))
+    found = dense_depths(images, everywhere(images), cameras, sparse, OPTIONS, 2)
+    for view, truth in zip(found, depths, strict=True):
+        assert view.depth.shape == view.filled.shape == truth.shape
+        assert view.normal.shape == (*truth.shape, 3)
+        assert np.median(relative_error(view, truth)) < 0.004
+
+
+def test_views_that_cannot_be_compared_give_no_depth():
+    cameras, images, _, sparse = scene((0.0, 0.0))
+    found = dense_depths(images, everywhere(images), cameras, sparse, OPTIONS, 1)
+    for view in found:
+        assert not view.depth.any()
+        assert (view.confidence == 1).all()
+    single = dense_depths(images[:1], everywhere(images[:1]), cameras[:1], sparse[:1], OPTIONS, 1)
+    assert not single[0].depth.any()
+
+
+def test_a_backdrop_without_texture_falls_behind(three):
+    cameras, images, depths, sparse, _, _ = three
+    dark = [
+        np.where((depth > 4.1)[..., None], np.float32(0.03), image)
+        for image, depth in zip(images, depths, strict=True)
+    ]
+    found = dense_depths(dark, everywhere(dark), cameras, sparse, OPTIONS, 2)
+    for view, truth in zip(found, depths, strict=True):
+        backdrop = (truth > 4.1) & (view.depth == 0)
+        assert backdrop.mean() > 0.3
+        guess = view.filled[backdrop]
+        assert (guess > 0).mean() > 0.9
+        known = view.depth[view.depth > 0]
+        assert np.percentile(guess[guess > 0], 10) > np.percentile(known, 80)
+        assert np.median(guess[guess > 0]) > known.max()
+
+
+def test_highlights_are_found_and_bright_enamel_is_not():
+    image = np.full((60, 80, 3), (0.86, 0.82, 0.68), np.float32)
+    image[20:26, 30:38] = 1.0
+    image[:, 60:] = (0.7, 0.4, 0.4)
+    image[40:44, 66:70] = (0.8, 0.7, 0.7)
+    bright = highlights(image, grow=0) > 0
+    assert bright[20:26, 30:38].all()
+    assert bright[40:44, 66:70].all()
+    assert bright.sum() == 6 * 8 + 4 * 4
+
+
+def test_sources_have_a_useful_angle_and_lie_on_both_sides():
+    angles = (-40.0, -12.0, -1.0, 0.0, 11.0, 14.0, 80.0)
+    cameras = [camera(f"{k}", angle) for k, angle in enumerate(angles)]
+    _, depth = render(cameras[3])
+    points = cameras[3].unproject(depth).reshape(-1, 3)[::50]
+    chosen = select_sources(3, cameras, points, 3)
+    assert set(chosen[:2]) in ({1, 4}, {1, 5})
+    assert 2 not in chosen
+    assert 6 not in select_sources(3, cameras, points, 6)
+
+
+def test_depth_range_holds_the_scene_though_sparse_points_have_outliers(three):
+    cameras, _, depths, sparse, _, _ = three
+    points = scene_points(cameras, sparse)
+    points[1] = np.concatenate([points[1], [[*cameras[1].centre[:2], 0.01]]])
+    far, near = inverse_depth_range(cameras[1], points[1], np.concatenate(points), 0.25)
+    assert 1 / far > depths[1].max()
+    assert depths[1].min() * 0.5 < 1 / near < depths[1].min()
+
+
+def test_wrong_input_is_refused(three):
+    cameras, images, _, sparse, _, _ = three
+    with pytest.raises(ValueError, match="per view"):
+        dense_depths(images[:2], everywhere(images), cameras, sparse, OPTIONS, 1)
+    with pytest.raises(ValueError, match="view 000"):
+        dense_depths(
+            [image[:-1] for image in images], everywhere(images), cameras, sparse, OPTIONS, 1
+        )
+    with pytest.raises(ValueError, match="sweep"):
+        dense_depths(
+            images, everywhere(images), cameras, sparse, replace(OPTIONS, method="magic"), 1
+        )
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(not DATA.is_dir(), reason="no real data here")
+def test_three_frames_of_the_scan_video():
+    """Frames 17 degrees apart, exact cameras: a tenth of a millimetre on teeth and gums."""
+    import json
+
+    import cv2
+
+    from pipeline.artifacts.cameras import Camera
+
+    meta = json.loads((DATA / "transforms.json").read_text())
+    cameras, images, depths, masks, sparse = [], [], [], [], []
+    for number in (7, 11, 15):
+        frame = meta["frames"][number]
+        bgr = cv2.imread(str(DATA / frame["file_path"]))
+        images.append(np.ascontiguousarray(bgr[..., ::-1]).astype(np.float32) / 255)
+        depths.append(cv2.imread(str(DATA / frame["depth_file_path"]), -1) / np.float32(200))
+        masks.append(cv2.imread(str(DATA / frame["mask_path"]), 0))
+        cameras.append(
+            Camera(
+                f"{number:03d}", meta["w"], meta["h"], meta["fl_x"], meta["fl_y"],
+                meta["cx"], meta["cy"], np.array(frame["w2c_opencv"]),
+            )
+        )  # fmt: skip
+        seen = cameras[-1].unproject(depths[-1])[depths[-1] > 0]
+        sparse.append(seen[:: len(seen) // 150].astype(np.float32))
+    found = dense_depths(images, everywhere(images), cameras, sparse, DenseOptions(), 2)
+    error, count = [], 0
+    for view, truth, mask in zip(found, depths, masks, strict=True):
+        good = (view.depth > 0) & (mask > 0)
+        error.append(np.abs(view.depth - truth)[good])
+        count += int(good.sum())
+    millimetres = np.concatenate(error)
+    assert count > 300_000
+    assert np.median(millimetres) < 0.1
+    assert np.percentile(millimetres, 90) < 0.45
+    assert np.mean(millimetres > 2) < 0.02

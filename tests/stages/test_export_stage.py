@@ -1,0 +1,257 @@
+"""The export stage as a whole: every file, what it says, and that it says no more."""
+
+import hashlib
+import json
+from dataclasses import replace
+from importlib import util
+from pathlib import Path
+
+import av
+import numpy as np
+import open3d
+import pycolmap
+import pytest
+
+from pipeline.artifacts.cameras import Cameras, read_colmap
+from pipeline.artifacts.gaussians import read_gaussians_ply
+from pipeline.artifacts.views import View, Views, read_png, to_uint8
+from pipeline.errors import ReconstructionError
+from pipeline.stage import LocalContext
+from stages.export.frame import move_cameras
+from stages.export.stage import ExportConfig, ExportStage
+
+_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
+assert _spec and _spec.loader
+scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(scene)
+
+#: our world -> the input's millimetres
+SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])
+SMALL = {
+    "mesh_faces": 2000, "mesh_resolution": 64, "mesh_views": 3, "video_seconds": 0.8,
+    "video_fps": 10, "colmap_points": 400,
+}  # fmt: skip
+
+
+def export(folder: Path, threads: int = 1, inputs: dict | None = None, **settings) -> LocalContext:
+    case = scene.ball_case() if inputs is None else inputs
+    config = ExportConfig(**{**SMALL, **settings})
+    context = LocalContext(config, folder, case, threads=threads)
+    ExportStage().run(context)
+    return context
+
+
+def metric_case() -> dict:
+    case = scene.ball_case()
+    mask = np.ones((scene.HEIGHT, scene.WIDTH), bool)
+    mask[:10] = False
+    first = replace(case["views"].views[0], mask=mask)
+    case["views"] = Views((first, *case["views"].views[1:]))
+    case["cameras"] = Cameras(case["cameras"].cameras, input_from_world=SIMILARITY, units="mm")
+    return case
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> LocalContext:
+    return export(tmp_path_factory.mktemp("export"), inputs=metric_case())
+
+
+@pytest.fixture(scope="module")
+def folder(exported: LocalContext) -> Path:
+    return exported.folder / "exports"
+
+
+def bytes_of(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_everything_is_there_and_counted(exported: LocalContext, folder: Path) -> None:
+    description = json.loads((folder / "scene.json").read_text())
+    assert set(description["files"]) == {
+        "viewer.html", "preview.png", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl",
+        "points.ply", "colmap", "transforms.json",
+    }  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == {
+        *description["files"], "scene.json", "README.txt",
+    }  # fmt: skip
+    assert description["frame"]["units"] == "mm"
+    assert description["frame"]["name"] == "input"
+    np.testing.assert_allclose(description["frame"]["frame_from_world"], SIMILARITY)
+    np.testing.assert_allclose(description["frame"]["up"], [1, 0, 0], atol=0.01)
+    assert description["counts"]["photographs"] == 4
+    assert description["counts"]["placed_photographs"] == 3
+    assert "millimetres" in (folder / "README.txt").read_text()
+    assert exported.figures["splats"] == 1500
+    assert exported.figures["mesh_faces"] == description["counts"]["mesh_faces"] > 500
+    assert 0.05 < exported.figures["page_mb"] < 1
+    assert not exported.warnings
+
+
+def test_nothing_says_who_or_where(exported: LocalContext, folder: Path) -> None:
+    secrets = [b"Smith", b"John", b"5ec2e7", b"Exif", b"EXIF", str(exported.folder).encode()]
+    for path in folder.rglob("*"):
+        assert "smith" not in path.name.lower()
+        if path.is_file():
+            data = path.read_bytes()
+            for secret in secrets:
+                assert secret not in data, f"{path.name} holds {secret!r}"
+
+
+def test_pngs_hold_pixels_only(folder: Path) -> None:
+    for path in folder.rglob("*.png"):
+        data, at, kinds = path.read_bytes(), 8, set()
+        while at < len(data):
+            kinds.add(data[at + 4 : at + 8])
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        assert kinds <= {b"IHDR", b"IDAT", b"IEND"}, path.name
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path, folder: Path) -> None:
+    again = export(tmp_path, threads=2, inputs=metric_case())
+    assert bytes_of(again.folder / "exports") == bytes_of(folder)
+
+
+def test_splats_are_in_the_stated_frame(folder: Path) -> None:
+    splats = read_gaussians_ply(folder / "splats.ply")
+    before = scene.ball_gaussians()
+    expected = before.means @ SIMILARITY[:3, :3].T + SIMILARITY[:3, 3]
+    np.testing.assert_allclose(splats["means"], expected, atol=1e-4)
+    np.testing.assert_allclose(splats["log_scales"], before.log_scales + np.log(20), atol=1e-5)
+
+
+def test_the_colmap_model_agrees_with_the_cameras(folder: Path) -> None:
+    expected = move_cameras(scene.ball_cameras(), SIMILARITY)
+    found = read_colmap(folder / "colmap" / "sparse" / "0")
+    assert [camera.name for camera in found] == ["000", "001", "002"]
+    for camera, truth in zip(found, expected, strict=True):
+        np.testing.assert_allclose(camera.cam_from_world, truth.cam_from_world, atol=1e-9)
+        np.testing.assert_allclose(camera.matrix, truth.matrix)
+    model = pycolmap.Reconstruction(str(folder / "colmap" / "sparse" / "0"))
+    assert model.num_reg_images() == 3
+    assert 100 < model.num_points3D() <= 400
+    for image in model.images.values():
+        assert (folder / "colmap" / "images" / image.name).exists()
+        camera = model.cameras[image.camera_id]
+        assert image.num_points3D > 50
+        for point2d in image.points2D:
+            point = model.points3D[point2d.point3D_id]
+            pixel = camera.img_from_cam(image.cam_from_world() * point.xyz)
+            np.testing.assert_allclose(pixel, point2d.xy, atol=1e-3)
+            # nothing on the far side of the ball is called seen
+            centre = SIMILARITY[:3, 3]
+            eye = image.projection_center() - centre
+            assert (point.xyz - centre) @ eye > 0
+
+
+def test_the_images_are_the_photographs(folder: Path) -> None:
+    for view in scene.ball_case()["views"].views[:3]:
+        picture = read_png(folder / "colmap" / "images" / f"{view.name}.png")
+        assert np.array_equal(picture, to_uint8(view.image))
+    assert not (folder / "colmap" / "images" / "003.png").exists(), "it has no camera"
+    mask = read_png(folder / "colmap" / "masks" / "000.png.png")
+    assert (mask[:10] == 0).all() and (mask[10:] == 255).all()
+
+
+def test_nerfstudios_cameras_agree(folder: Path) -> None:
+    transforms = json.loads((folder / "transforms.json").read_text())
+    assert (folder / transforms["ply_file_path"]).exists()
+    for frame, truth in zip(
+        transforms["frames"], move_cameras(scene.ball_cameras(), SIMILARITY), strict=True
+    ):
+        assert (folder / frame["file_path"]).exists()
+        assert (folder / frame["mask_path"]).exists()
+        assert (frame["w"], frame["h"]) == (truth.width, truth.height)
+        opengl = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(opengl[:3, 3], truth.centre, atol=1e-9)
+        np.testing.assert_allclose(opengl[:3, 2], -truth.rotation[2], atol=1e-9)  # looks along -z
+        np.testing.assert_allclose(opengl[:3, 1], -truth.rotation[1], atol=1e-9)  # y is up
+        assert np.linalg.det(opengl[:3, :3]) == pytest.approx(1)
+        assert (frame["fl_x"], frame["fl_y"]) == (truth.fx, truth.fy)
+        assert (frame["cx"], frame["cy"]) == (truth.cx, truth.cy)
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "mesh.stl"])
+def test_the_mesh_is_the_ball_where_it_was_seen(folder: Path, name: str) -> None:
+    mesh = open3d.io.read_triangle_mesh(str(folder / name))
+    assert 500 < len(mesh.triangles) <= 2000
+    local = (np.asarray(mesh.vertices) - SIMILARITY[:3, 3]) / 20
+    error = np.abs(np.linalg.norm(local, axis=1) - 1)
+    assert np.median(error) < 0.03
+    assert np.percentile(error, 95) < 0.15
+    assert local[:, 2].min() < -0.9
+    if name == "mesh.ply":
+        assert mesh.has_vertex_colors()
+
+
+def test_both_ways_to_a_mesh(tmp_path: Path) -> None:
+    for method in ("tsdf", "poisson"):
+        context = export(
+            tmp_path / method, mesh_method=method, colmap=False, video=False, viewer=False,
+            preview=False,
+        )  # fmt: skip
+        mesh = open3d.io.read_triangle_mesh(str(tmp_path / method / "exports" / "mesh.ply"))
+        error = np.abs(np.linalg.norm(np.asarray(mesh.vertices), axis=1) - 1)
+        assert np.median(error) < 0.03
+        assert context.figures["mesh_faces"] == len(mesh.triangles)
+        names = {path.name for path in (tmp_path / method / "exports").iterdir()}
+        assert names == {"splats.ply", "mesh.ply", "mesh.stl", "scene.json", "README.txt"}
+
+
+def test_the_video_plays_and_shows_the_scene(folder: Path) -> None:
+    with av.open(str(folder / "orbit.mp4")) as video:
+        stream = video.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        assert stream.average_rate == 10
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == 8
+    truth = scene.ball_case()["views"].views[1].image * 255.0
+    for frame in frames:
+        assert frame.shape == (scene.HEIGHT, scene.WIDTH, 3)
+        assert frame[40:80, 60:100].mean() > 40
+    assert np.abs(frames[0] - truth).mean() < 12, "it starts at the middle photograph"
+    assert np.abs(frames[0][:, ::-1] - truth).mean() > 20
+    assert np.abs(frames[2].astype(float) - frames[6]).mean() > 5, "the camera moves"
+
+
+def test_the_preview_is_a_picture(folder: Path) -> None:
+    picture = read_png(folder / "preview.png")
+    assert picture.ndim == 3
+    assert 800 < picture.shape[1] < 1300
+    assert picture.std() > 30
+
+
+def test_too_little_for_a_mesh_is_said_and_the_rest_is_made(tmp_path: Path) -> None:
+    case = scene.ball_case()
+    case["points"] = case["points"][np.arange(20)]
+    context = export(tmp_path, inputs=case, video=False)
+    assert len(context.warnings) == 1 and "No mesh" in context.warnings[0]
+    assert context.figures["mesh_faces"] == 0
+    names = {path.name for path in (tmp_path / "exports").iterdir()}
+    assert "mesh.ply" not in names and {"viewer.html", "preview.png", "splats.ply"} <= names
+    assert json.loads((tmp_path / "exports" / "scene.json").read_text())["skipped"]
+
+
+def test_points_are_optional_and_views_may_differ_in_size(tmp_path: Path) -> None:
+    case = scene.ball_case()
+    del case["points"]
+    small = case["cameras"].cameras[2].resized(81, 61)
+    image = np.ascontiguousarray(case["views"].views[2].image[:61, :81])
+    case["cameras"] = Cameras((*case["cameras"].cameras[:2], small))
+    case["views"] = Views((*case["views"].views[:2], View(name="002", image=image)))
+    context = export(tmp_path, inputs=case)
+    assert context.figures["mesh_faces"] > 300
+    description = json.loads((tmp_path / "exports" / "scene.json").read_text())
+    assert description["frame"]["units"] == "arbitrary"
+    assert description["frame"]["name"] == "world"
+
+
+def test_without_cameras_it_says_so(tmp_path: Path) -> None:
+    case = scene.ball_case()
+    case["cameras"] = Cameras(())
+    with pytest.raises(ReconstructionError, match="none of the photographs"):
+        export(tmp_path, inputs=case)

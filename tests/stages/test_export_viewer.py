@@ -1,0 +1,240 @@
+"""The viewer page: its packed splats, and what a real browser makes of it."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from importlib import util
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.views import to_uint8
+from stages.export.orbits import find_orbit
+from stages.export.page import build_page, rasterizer_constants
+from stages.export.splats import coefficients, pack, texels, used_degree, visible
+from stages.splatting.rendering import render
+
+_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
+assert _spec and _spec.loader
+scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(scene)
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    error = ((a.astype(float) - b.astype(float)) ** 2).mean()
+    return float(10 * np.log10(255**2 / max(error, 1e-12)))
+
+
+def page(degree: int = 1, photos: bool = True) -> str:
+    gaussians, cameras = scene.ball_gaussians(degree=degree), scene.ball_cameras()
+    pictures = {camera.name: to_uint8(render(gaussians, camera).image) for camera in cameras}
+    return build_page(
+        gaussians, cameras, find_orbit(cameras, [3.0] * 3), pictures if photos else {},
+        rasterizer_constants(gaussians, cameras),
+    )  # fmt: skip
+
+
+def browse(file: Path, address: str, size: tuple[int, int], *extra: str) -> tuple[str, str]:
+    """Open a page from disk in headless Chromium; returns what it printed, and its log."""
+    assert CHROMIUM
+    profile = file.parent / f"profile{len(list(file.parent.iterdir()))}"
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        "--hide-scrollbars", f"--window-size={size[0]},{size[1]}", "--virtual-time-budget=3000",
+        f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *extra,
+        f"file://{file}{address}",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return done.stdout, done.stderr
+
+
+def console(log: str) -> list[str]:
+    """Console messages of the page, without the graphics driver's remarks on speed."""
+    return [
+        line for line in log.splitlines()
+        if "CONSOLE" in line and "GL Driver Message" not in line
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_packing_keeps_what_is_visible(degree: int) -> None:
+    gaussians = scene.ball_gaussians(degree=degree)
+    assert used_degree(gaussians) == degree
+    words = pack(gaussians, degree)
+    assert words.shape == (len(gaussians), 4 * texels(degree))
+    assert 4 * words.shape[1] == {0: 32, 1: 48, 2: 80, 3: 128}[degree]
+    assert np.array_equal(words[:, :3].copy().view("<f4"), gaussians.means)
+    halfs = np.ascontiguousarray(words[:, 4:]).view("<f2").astype(float)
+    np.testing.assert_allclose(halfs[:, :3], gaussians.log_scales, atol=0.002)
+    opacity = 1 / (1 + np.exp(-gaussians.logit_opacities))
+    np.testing.assert_allclose(halfs[:, 3], opacity, atol=0.0005)
+    harmonics = halfs[:, 4 : 7 + 3 * coefficients(degree)].reshape(len(words), -1, 3)
+    np.testing.assert_allclose(harmonics, gaussians.sh[:, : (degree + 1) ** 2], atol=0.001)
+
+    largest = words[:, 3] >> 30
+    others = np.stack([words[:, 3] >> shift & 1023 for shift in (0, 10, 20)], 1)
+    others = (others / 1023 * 2 - 1) / np.sqrt(2)
+    quats = np.zeros((len(words), 4))
+    for row, (place, rest) in enumerate(zip(largest, others, strict=True)):
+        quats[row] = np.insert(rest, place, np.sqrt(1 - rest @ rest))
+    off = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).inv() * Rotation.from_quat(
+        gaussians.quats_wxyz[:, [1, 2, 3, 0]]
+    )
+    assert np.degrees(off.magnitude()).max() < 0.2
+
+
+def test_what_cannot_be_seen_is_not_carried() -> None:
+    ball = scene.ball_gaussians(count=8)
+    logits, means = ball.logit_opacities.copy(), ball.means.copy()
+    logits[2], means[5, 1] = -9, np.nan
+    kept = visible(
+        Gaussians(means, ball.quats_wxyz, ball.log_scales, logits, ball.sh), alpha_min=1 / 255
+    )
+    assert kept.tolist() == [True, True, False, True, True, False, True, True]
+
+
+def test_the_page_is_whole_and_needs_no_network() -> None:
+    text = page()
+    assert not re.search(r"{{(scene|splats|scripts)}}", text)
+    assert not re.search(r"https?://(?!www\.w3\.org)", text)
+    assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=[\"'](?!data:)", text)
+    assert "<title>dentalsplat</title>" in text
+    assert text == page(), "the same scene gives the same page"
+    described = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
+    assert described["format"]["count"] == 1500
+    splats = base64.b64decode(re.search(r'id="splats">(.*?)</script>', text, re.S)[1])
+    assert len(splats) == 1500 * 48
+    for view in described["views"]:
+        jpeg = base64.b64decode(view["photo"].partition(",")[2])
+        assert b"Exif" not in jpeg
+        assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1).shape == (120, 160, 3)
+
+
+@needs_chromium
+def test_a_browser_draws_what_our_rasterizer_draws(tmp_path: Path) -> None:
+    file = tmp_path / "viewer.html"
+    file.write_text(page(degree=3))
+    shot = tmp_path / "shot.png"
+    camera = scene.ball_cameras()[2].resized(640, 480)  # Chromium has no smaller windows than 500
+    _, log = browse(file, "#view=3&bare&still", (640, 480), f"--screenshot={shot}")
+    assert console(log) == []
+    picture = cv2.imread(str(shot))[..., ::-1]
+    expected = to_uint8(render(scene.ball_gaussians(degree=3), camera).image)
+    assert picture.shape == expected.shape
+    # Ours stops at 1e-4 transmittance and stores 32 bits, the page 16: 55 dB and more when written.
+    assert psnr(picture, expected) > 40
+    assert psnr(picture[:, ::-1], expected) < 20, "mirrored"
+    assert psnr(picture[::-1], expected) < 20, "upside down"
+
+
+PROBE = """
+<script>
+(async () => {
+  const result = {};
+  const page = window.dentalsplat;
+  await page.ready;
+  const sum = () => page.pixels().reduce((total, value) => total + value, 0);
+  const wait = async (ms) => {
+    await new Promise((done) => setTimeout(done, ms));
+    page.render();  // virtual time may run ahead of the frames
+  };
+  page.setCamera(CAMERA);
+  result.pixels = Array.from(page.pixels());
+  page.setBackground([1, 1, 1]);
+  result.corner = Array.from(page.pixels().slice(0, 4));
+  page.setBackground([0, 0, 0]);
+
+  const canvas = document.getElementById("canvas");
+  const photo = document.getElementById("photo");
+  const slider = document.getElementById("opacity");
+  const press = (key) => dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  document.querySelectorAll("#views button")[0].click();
+  await wait(900);
+  result.label = document.getElementById("label").textContent;
+  const first = sum();
+  slider.value = 60;
+  slider.dispatchEvent(new Event("input"));
+  await wait(100);
+  result.photo = photo.style.opacity;
+  const move = (type, x, y, id = 7) => canvas.dispatchEvent(new PointerEvent(type,
+    { pointerId: id, clientX: x, clientY: y, buttons: 1, bubbles: true }));
+  canvas.setPointerCapture = () => {};
+  move("pointerdown", 50, 50);
+  for (let x = 50; x < 90; x += 4) move("pointermove", x, 50);
+  move("pointerup", 90, 50);
+  await wait(100);
+  result.photoAfterDrag = photo.style.opacity;
+  result.changedByDrag = sum() !== first;
+  result.labelAfterDrag = document.getElementById("label").textContent;
+  for (let k = 0; k < 200; k++) canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 100 }));
+  result.farAway = sum() > 0;
+  for (let k = 0; k < 400; k++) canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: -100 }));
+  result.close = sum() > 0;
+  for (let k = 0; k < 100; k++) press("ArrowUp");
+  result.above = sum() > 0;
+  press("h");
+  result.help = !document.getElementById("help").hidden;
+  press("1");
+  await wait(900);
+  result.sameAgain = sum() === first;
+  press("a");
+  await wait(300);
+  result.turning = document.getElementById("turn").getAttribute("aria-pressed");
+  press("r");
+  await wait(900);
+  result.labelAfterReset = document.getElementById("label").textContent;
+  const text = document.createElement("pre");
+  text.id = "result";
+  text.textContent = JSON.stringify({ ...result, state: document.documentElement.dataset.state,
+    errors: document.documentElement.dataset.errors ?? "" });
+  document.body.append(text);
+})();
+</script>
+</body>"""
+
+
+@needs_chromium
+def test_the_page_can_be_steered(tmp_path: Path) -> None:
+    camera = scene.ball_cameras()[0].resized(96, 72)
+    numbers = json.dumps(camera.cam_from_world.ravel().tolist())
+    call = f"{numbers}, {camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}, 96, 72"
+    file = tmp_path / "probe.html"
+    file.write_text(page().replace("</body>", PROBE.replace("CAMERA", call)))
+    dom, log = browse(file, "", (480, 360), "--dump-dom", "--virtual-time-budget=20000")
+    assert console(log) == []
+    result = json.loads(re.search(r"<pre id=\"result\">(.*?)</pre>", dom, re.S)[1])
+    assert result["errors"] == ""
+    assert result["state"] == "ready"
+    picture = np.array(result["pixels"], np.uint8).reshape(72, 96, 4)[..., :3]
+    expected = to_uint8(render(scene.ball_gaussians(), camera).image)
+    assert psnr(picture, expected) > 40
+    assert result["corner"] == [255, 255, 255, 255]
+    assert result["label"] == "View 1"
+    assert float(result["photo"]) == pytest.approx(0.6)
+    assert float(result["photoAfterDrag"]) == 0
+    assert result["labelAfterDrag"] == ""
+    assert result["labelAfterReset"] == "View 2"
+    assert result["turning"] == "true"
+    for what in ("changedByDrag", "farAway", "close", "above", "help", "sameAgain"):
+        assert result[what] is True, what
+
+
+@needs_chromium
+def test_without_webgl_the_page_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "viewer.html"
+    blind = page(photos=False).replace('getContext("webgl2"', 'getContext("nothing"')
+    file.write_text(blind)
+    dom, _ = browse(file, "", (480, 360), "--dump-dom")
+    assert 'data-state="failed"' in dom
+    assert "offers no WebGL2" in dom

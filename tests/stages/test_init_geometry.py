@@ -1,0 +1,239 @@
+"""Two-view geometry, the pair graph, focal length and mapping, on points projected exactly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stages.init.focal import better, search_focal
+from stages.init.geometry import (
+    Correspondences,
+    Lens,
+    TwoView,
+    angle_between,
+    coherent_matches,
+    spanning_tree,
+    trusted_edges,
+    verify_pair,
+)
+from stages.init.mapping import MappingInput, Solution, map_views
+from stages.init.normalise import moved_points, moved_pose, world_similarity
+from stages.init.options import ClassicalOptions
+from stages.init.solver import Solver, known_focal, unknown_focal
+
+WIDTH, HEIGHT, FOCAL = 512, 384, 700.0
+
+
+def orbit(angles):
+    """Cameras that look at the origin from 5 away, at the yaw angles given (degrees)."""
+    poses = []
+    for angle in angles:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("xy", [4, angle], degrees=True).as_matrix()
+        pose[:3, 3] = (0.1, 0, 5)
+        poses.append(pose)
+    return poses
+
+
+def make_scene(angles, count=400, noise=0.3, false_share=0.2, seed=0):
+    """Matches among all views of points on a bumpy surface, with noise and false matches."""
+    rng = np.random.default_rng(seed)
+    flat = rng.uniform(-1, 1, (count, 2)) * (1.6, 1.1)
+    depth = 0.5 * np.sin(2 * flat[:, 0]) * np.cos(3 * flat[:, 1]) - 0.4 * flat[:, 0] ** 2
+    points = np.column_stack([flat, depth])
+    poses = orbit(angles)
+    pixels = []
+    for pose in poses:
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        exact = local[:, :2] / local[:, 2:] * FOCAL + (WIDTH / 2, HEIGHT / 2)
+        pixels.append(exact + rng.normal(0, noise, exact.shape))
+    correspondences = {}
+    for i in range(len(poses)):
+        for j in range(i + 1, len(poses)):
+            match = np.stack([np.arange(count)] * 2, 1)
+            wrong = rng.random(count) < false_share
+            match[wrong, 1] = rng.permutation(match[wrong, 1])
+            pair = (pixels[i][match[:, 0]], pixels[j][match[:, 1]])
+            correspondences[i, j] = Correspondences(match, *pair, coherent_matches(*pair, 40.0))
+    given = MappingInput(
+        lenses=[Lens(WIDTH, HEIGHT)],
+        lens_of_view=[0] * len(poses),
+        positions=pixels,
+        points=[np.arange(count)] * len(poses),
+        correspondences=correspondences,
+    )
+    return given, poses
+
+
+def worst_rotation(solution, poses):
+    """Largest error in degrees of the rotations between the first placed view and the others."""
+    first, *others = sorted(solution.poses)
+    return max(
+        angle_between(
+            solution.poses[k][:3, :3] @ solution.poses[first][:3, :3].T,
+            poses[k][:3, :3] @ poses[first][:3, :3].T,
+        )
+        for k in others
+    )
+
+
+def edge(rotation, inliers=200, coherence=0.95):
+    pose = np.hstack([rotation, [[1], [0], [0]]])
+    return TwoView(300, np.arange(inliers), coherence, pose)
+
+
+def yaw(degrees):
+    return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+
+
+def test_a_pair_with_false_matches_gives_its_rotation():
+    given, poses = make_scene([0, 15])
+    camera = given.lenses[0].camera(FOCAL)
+    found = verify_pair(
+        given.correspondences[0, 1], camera, camera, max_error=2, coherence_radius=40, seed=0
+    )
+    truth = poses[1][:3, :3] @ poses[0][:3, :3].T
+    assert angle_between(found.rotation, truth) < 0.5
+    assert 0.7 * 400 < len(found.inliers) < 0.85 * 400
+    assert found.coherence > 0.85
+
+
+def test_random_matches_are_not_believed():
+    rng = np.random.default_rng(1)
+    pair = rng.uniform(0, 380, (500, 2)), rng.uniform(0, 380, (500, 2))
+    matches = Correspondences(np.zeros((500, 2), int), *pair, coherent_matches(*pair, 40.0))
+    camera = Lens(WIDTH, HEIGHT).camera(FOCAL)
+    found = verify_pair(matches, camera, camera, max_error=2, coherence_radius=40, seed=0)
+    assert found is None or not trusted_edges({(0, 1): found}, 2)
+
+
+def test_coherence_tells_matches_that_move_alone():
+    grid = np.stack(np.meshgrid(np.arange(0, 200, 20.0), np.arange(0, 200, 20.0)), -1)
+    grid = grid.reshape(-1, 2)
+    moved = grid + (30, 2)
+    moved[17] += (0, 60)
+    coherent = coherent_matches(grid, moved, 40.0)
+    assert not coherent[17]
+    assert coherent.sum() == len(grid) - 1
+    assert not coherent_matches(grid[:2], moved[:2], 40.0).any()
+
+
+def test_spanning_tree_takes_the_heaviest_edges():
+    tree = spanning_tree({(0, 1): 5.0, (1, 2): 4.0, (0, 2): 3.0, (3, 4): 1.0}, 5)
+    assert tree == [(0, 1), (1, 2), (3, 4)]
+
+
+def test_an_edge_that_contradicts_its_cycle_is_dropped():
+    edges = {(0, 1): edge(yaw(10)), (1, 2): edge(yaw(10)), (0, 2): edge(yaw(21), 100)}
+    assert trusted_edges(edges, 3) == [(0, 1), (0, 2), (1, 2)]
+    edges[0, 2] = edge(yaw(45), 100)
+    assert trusted_edges(edges, 3) == [(0, 1), (1, 2)]
+
+
+def test_incoherent_pairs_do_not_link_views():
+    edges = {(0, 1): edge(yaw(10)), (1, 2): edge(yaw(10), 70, 0.7)}
+    assert trusted_edges(edges, 3) == [(0, 1)]
+
+
+@pytest.mark.parametrize("method", ["incremental", "global"])
+def test_mapping_finds_the_cameras_twice_the_same(method, tmp_path):
+    given, poses = make_scene([-20, 0, 15, 30], count=250)
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    edges = solver.edges_used(None) or solver._edges([FOCAL])
+    options = {
+        "refine_focal": False, "method": method, "max_error": 2.0, "min_tri_angle": 1.0,
+        "seed": 0, "scratch": tmp_path,
+    }  # fmt: skip
+    first, second = (map_views(given, edges, [FOCAL], **options) for _ in range(2))
+    assert sorted(first.poses) == [0, 1, 2, 3]
+    assert worst_rotation(first, poses) < 0.2
+    assert first.error < 0.6
+    assert np.median(first.triangulation_angles()) > 10
+    for name in ("points", "observed_point", "observed_view", "residuals"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    for view, pose in first.poses.items():
+        np.testing.assert_array_equal(pose, second.poses[view])
+
+
+def test_the_focal_length_comes_from_the_views(tmp_path):
+    given, poses = make_scene([-22, 0, 20])
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 2, tmp_path)
+    solution, determined = unknown_focal(solver, True, lambda *_: None)
+    assert determined
+    assert solution.focals[0] == pytest.approx(FOCAL, rel=0.03)
+    assert worst_rotation(solution, poses) < 0.3
+
+
+def test_threads_change_nothing(tmp_path):
+    given, _ = make_scene([-15, 0, 15], count=200)
+    first, second = (
+        unknown_focal(Solver(given, ClassicalOptions(), 1.0, 0, n, tmp_path), True, lambda *_: None)
+        for n in (1, 3)
+    )
+    np.testing.assert_array_equal(first[0].points, second[0].points)
+    assert first[0].focals == second[0].focals
+
+
+def test_a_known_focal_length_is_kept_where_results_drift_from_it(tmp_path):
+    given, _ = make_scene([-15, 0, 15], count=200)
+    for known, expected in ((FOCAL * 1.03, FOCAL), (FOCAL * 1.4, FOCAL * 1.4)):
+        lens = replace(given.lenses[0], focal=known)
+        solver = Solver(replace(given, lenses=[lens]), ClassicalOptions(), 1.0, 0, 1, tmp_path)
+        solution = known_focal(solver, True, lambda *_: None)
+        assert solution.focals[0] == pytest.approx(expected, rel=0.02)
+
+
+def solution_with(views, error):
+    return Solution(
+        {view: np.eye(4) for view in range(views)}, {}, np.zeros((1, 3)), np.zeros(1, int),
+        np.zeros(1, int), np.zeros((1, 2)), np.array([error]),
+    )  # fmt: skip
+
+
+def test_focal_search_prefers_views_then_the_minimum_between_candidates():
+    def solve(ratio):
+        views = 2 if ratio < 0.8 else 3
+        return solution_with(views, 0.1 if views == 2 else 0.3 + np.log(ratio / 1.6) ** 2)
+
+    result = search_focal(solve)
+    assert result.determined
+    assert len(result.solution.poses) == 3
+    assert result.ratio == pytest.approx(1.6, rel=0.02)
+
+
+def test_focal_search_says_when_it_finds_no_minimum():
+    result = search_focal(lambda ratio: solution_with(3, 1 / ratio))
+    assert not result.determined
+    assert search_focal(lambda ratio: None) is None
+
+
+def test_more_views_are_better_than_small_errors():
+    many, few = solution_with(3, 0.9), solution_with(2, 0.1)
+    assert better(many, few) is many
+    assert better(few, many) is many
+    assert better(None, few) is few
+
+
+def test_the_normalised_world_stands_upright():
+    turn = Rotation.from_euler("xyz", [50, 20, 130], degrees=True).as_matrix()
+    world = np.random.default_rng(0).normal(size=(500, 3)) * 0.3
+    poses = []
+    for pose in orbit([-30, 0, 30]):
+        moved = np.eye(4)
+        moved[:3, :3] = pose[:3, :3] @ turn.T
+        moved[:3, 3] = 7 * pose[:3, 3]
+        poses.append(moved)
+    points = 7 * world @ turn.T
+    similarity = world_similarity(poses, points)
+    assert np.linalg.det(similarity[1]) == pytest.approx(1)
+    new_points = moved_points(points, *similarity)
+    new_poses = [moved_pose(pose, *similarity) for pose in poses]
+    np.testing.assert_allclose(np.median(new_points, axis=0), 0, atol=0.02)
+    depths = [new_points @ pose[2, :3] + pose[2, 3] for pose in new_poses]
+    assert np.median(np.concatenate(depths)) == pytest.approx(1)
+    assert new_poses[1][1, 1] > 0.99  # the middle camera's down is the world's y
+    assert new_poses[1][2, 2] > 0.99
+    for old, new in zip(poses, new_poses, strict=True):  # nothing moves in the image
+        before, after = points @ old[:3, :3].T + old[:3, 3], new_points @ new[:3, :3].T + new[:3, 3]
+        np.testing.assert_allclose(before[:, :2] / before[:, 2:], after[:, :2] / after[:, 2:])
