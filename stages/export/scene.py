@@ -37,8 +37,9 @@ Pixels = npt.NDArray[np.uint8]
 SH_CONSTANT = 0.28209479177387814
 #: A mesh with fewer triangles than this is no mesh of anything.
 FEWEST_FACES = 100
-#: The mesh needs a trusted point within this many of their spacings.
+#: The mesh needs a trusted point within this many of their spacings, or this many voxels.
 SUPPORT_REACH = 4.0
+SUPPORT_VOXELS = 6.0
 #: Connected parts of the mesh smaller than this share of the largest are dropped.
 SMALLEST_PART = 0.02
 #: Holes of up to this many edges are closed.
@@ -181,7 +182,7 @@ def build_mesh(
     trusted = scene.points[scene.points.confidence > confidence]
     if len(trusted) < FEWEST_FACES:
         return None
-    reach = max(4 * voxel, SUPPORT_REACH * spacing(trusted.positions))
+    reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * spacing(trusted.positions))
     if method == "poisson":
         oriented = trusted[np.linalg.norm(trusted.normals, axis=1) > 0.5]
         if len(oriented) < FEWEST_FACES:

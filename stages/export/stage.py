@@ -40,13 +40,13 @@ class ExportConfig(StageConfig):
         256, ge=32, le=1024, description="voxels across what a photograph shows"
     )
     mesh_smoothing: float = Field(
-        1.0,
+        2.0,
         ge=0,
         le=20,
         description="voxels that the Poisson refit of the fused surface evens out; 0: no refit",
     )
     mesh_views: int = Field(
-        24, ge=0, le=500, description="viewpoints between the photographs that are fused as well"
+        12, ge=0, le=500, description="viewpoints between the photographs that are fused as well"
     )
     mesh_depth: float = Field(
         2.0,
@@ -56,9 +56,10 @@ class ExportConfig(StageConfig):
         "photograph shows",
     )
     mesh_confidence: float = Field(
-        1.0,
-        ge=1,
-        description="only points with a confidence above this support the mesh (1: nothing known)",
+        1.25,
+        ge=0,
+        description="only points with a confidence above this support the mesh; up to 1.25 their "
+        "depth was filled in, not measured",
     )
     video: bool = Field(True, description="write orbit.mp4")
     video_seconds: float = Field(8.0, ge=0.5, le=120, description="length of one loop")

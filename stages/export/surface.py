@@ -47,12 +47,16 @@ class Mesh:
 def trusted_depth(
     depth: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating], farthest: float
 ) -> npt.NDArray[np.float32]:
-    """A depth map [H, W] with 0 where it is transparent, at a step, or too far."""
+    """A depth map [H, W] with 0 where it is transparent, at a step, or too far.
+
+    A median over 5 x 5 pixels takes out single Gaussians that stick out of the surface.
+    """
     clean = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
     step = cv2.dilate(clean, kernel) - cv2.erode(clean, kernel)
     good = (alpha >= LEAST_ALPHA) & (clean < farthest) & (step < STEEPEST_STEP * clean)
-    return np.where(good, clean, np.float32(0))
+    even = cv2.medianBlur(np.where(good, clean, np.float32(0)), 5)
+    return np.where(good & (even > 0), even, np.float32(0))
 
 
 def fuse_depths(
@@ -110,7 +114,7 @@ def poisson(
     deterministic on more.
 
     Args:
-        points, normals, colors: [N, 3] each.
+        points, normals, colors: [N, 3] each; points without a normal (0) are left out.
         depth: of the octree.
 
     Returns:
@@ -118,10 +122,11 @@ def poisson(
     """
     import open3d
 
+    oriented = np.linalg.norm(normals, axis=1) > 0.5
     cloud = open3d.geometry.PointCloud()
-    cloud.points = open3d.utility.Vector3dVector(np.asarray(points, np.float64))
-    cloud.normals = open3d.utility.Vector3dVector(np.asarray(normals, np.float64))
-    cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors, np.float64))
+    for name, values in (("points", points), ("normals", normals), ("colors", colors)):
+        vectors = open3d.utility.Vector3dVector(np.asarray(values, np.float64)[oriented])
+        setattr(cloud, name, vectors)
     mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
         cloud, depth=depth, n_threads=1
     )

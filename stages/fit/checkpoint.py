@@ -19,7 +19,7 @@ def save_checkpoint(path: Path, arrays: Arrays, facts: dict[str, Any]) -> None:
     temporary = path.with_name(path.name + ".tmp")
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     with temporary.open("wb") as file:
-        np.savez(file, _facts=text, **arrays)
+        np.savez(file, allow_pickle=False, _facts=text, **arrays)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)

@@ -1,4 +1,4 @@
-"""Density control: which Gaussians are cloned, split and pruned (3DGS; AbsGS for the split rule)."""
+"""Density control: which Gaussians are cloned, split and pruned (3DGS; AbsGS for splits)."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def thin(cloud: Cloud, target: int) -> Cloud:
             break
         smallest, largest = (size, largest) if count > target else (smallest, size)
     unique, cell = np.unique(cells(size), return_inverse=True)
-    mass = np.bincount(cell, cloud.weight, len(unique))
+    mass = np.asarray(np.bincount(cell, cloud.weight, len(unique)), np.float64)
 
     def mean(values: Array) -> Array:
         sums = [np.bincount(cell, cloud.weight * column, len(unique)) for column in values.T]

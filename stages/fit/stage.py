@@ -48,7 +48,7 @@ class FitConfig(StageConfig):
     )
     headlight: float = number(
         0.6,
-        "share of the light that is taken to come from the camera when degree 1 is started from normals; 0: start flat",
+        "share of the light that comes from the camera, to start degree 1 from normals",
         ge=0,
         lt=1,
     )
@@ -70,7 +70,7 @@ class FitConfig(StageConfig):
     position_lr_final: float = number(1.6e-6, "learning rate of positions at the end", gt=0)
     feature_lr: Auto | float = number(
         AUTO,
-        "learning rate of the constant colour (3DGS: 0.0025; auto: 2 times that, from 6 views 6 times)",
+        "learning rate of the constant colour (3DGS: 0.0025; auto: 2 or 6 times that)",
     )
     feature_rest_lr: Auto | float = number(
         AUTO, "learning rate of the other harmonics (3DGS: 0.000125)"
@@ -81,7 +81,7 @@ class FitConfig(StageConfig):
     optimize_poses: bool = number(True, "refine the camera poses as well")
     pose_lr_init: Auto | float = number(
         AUTO,
-        "learning rate of pose increments at the start, in radians and in units of the scene's depth",
+        "learning rate of pose increments at the start, radians and units of the scene's depth",
     )
     pose_lr_final: Auto | float = number(AUTO, "learning rate of pose increments at the end")
     pose_from_iter: int = number(0, "first iteration that refines poses", ge=0)
@@ -120,7 +120,7 @@ class FitConfig(StageConfig):
     )
     final_prune_near: float = number(
         0.5,
-        "at the end, remove Gaussians nearer to a camera that sees them than this share of the nearest input points' depth",
+        "finally remove Gaussians nearer to a view than this share of its nearest depth",
         ge=0,
         lt=1,
     )

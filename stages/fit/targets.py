@@ -61,9 +61,9 @@ def point_depth(
     column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
     inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = (row[inside] * width + column[inside]).astype(np.int64)
-    nearest = np.full(width * height, np.inf, np.float32)
-    np.minimum.at(nearest, index, depth[inside].astype(np.float32))
-    nearest = nearest.reshape(height, width)
+    buffer = np.full(width * height, np.inf, np.float32)
+    np.minimum.at(buffer, index, depth[inside].astype(np.float32))
+    nearest = buffer.reshape(height, width)
     front = cv2.erode(
         np.where(np.isfinite(nearest), nearest, np.float32(1e30)), np.ones((5, 5), np.uint8)
     )

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import ReconstructionError
-from stages.fit.checkpoint import load_checkpoint, save_checkpoint
+from stages.fit.checkpoint import Arrays, load_checkpoint, save_checkpoint
 from stages.fit.density import DensityStatistics, choose, grow
 from stages.fit.poses import PoseOptimizer
 from stages.fit.settings import FitSettings
@@ -254,7 +254,7 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write the whole state."""
-        arrays = {
+        arrays: Arrays = {
             "packed": self.packed,
             "first": self.adam.first,
             "second": self.adam.second,

@@ -11,7 +11,14 @@ import numpy.typing as npt
 
 from stages.init.blas import one_blas_thread
 from stages.init.features import Features, detect_features
-from stages.init.geometry import Correspondences, Lens, Pair, TwoView, coherent_matches
+from stages.init.geometry import (
+    Correspondences,
+    Lens,
+    Pair,
+    TwoView,
+    coherent_matches,
+    homography_share,
+)
 from stages.init.mapping import MappingInput, Solution
 from stages.init.matching import candidate_pairs, match_features, overlap_counts, select_pairs
 from stages.init.options import (
@@ -23,6 +30,9 @@ from stages.init.options import (
 from stages.init.parallel import in_threads
 from stages.init.solver import Progress, Solver, known_focal, unknown_focal
 
+#: How many pairs are asked whether there is any parallax.
+PAIRS_CHECKED_FOR_DEPTH = 4
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -33,12 +43,15 @@ class Evidence:
         matches: pair -> number of matches.
         displacement: pair -> median length in pixels by which its coherent matches move.
         edges: pair -> two-view geometry at the focal length used last.
+        flat: least share of the inliers of a pair that one homography explains, of the pairs used
+            that move most; 1: there is no depth to see.
     """
 
     keypoints: list[int]
     matches: dict[Pair, int]
     displacement: dict[Pair, float]
     edges: dict[Pair, TwoView] = field(default_factory=dict)
+    flat: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -114,9 +127,18 @@ def reconstruct(
     if best is not None:
         best = solver.with_other_mapper(best, free)
     progress("reconstruct", 1, 1)
+    edges = solver.edges_used(best)
+    used = [pair for pair in best.edges if pair in edges] if best else []
+    used.sort(key=lambda pair: (-evidence.displacement[pair], pair))
+    shares = [
+        homography_share(
+            correspondences[pair], edges[pair].inliers, options.max_error * pixel, seed
+        )
+        for pair in used[:PAIRS_CHECKED_FOR_DEPTH]
+    ]
     return Attempt(
         solution=best,
-        evidence=replace(evidence, edges=solver.edges_used(best)),
+        evidence=replace(evidence, edges=edges, flat=min(shares, default=0.0)),
         focal_known=known,
         focal_determined=determined,
     )

@@ -6,8 +6,8 @@ from typing import Any
 
 
 def quiet_pycolmap() -> Any:  # pycolmap has no types
-    """Import pycolmap and let it log nothing below an error."""
+    """Import pycolmap and let it log nothing: failures show in what it returns."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     return pycolmap

@@ -29,6 +29,7 @@ class Limits:
         min_points: points that each view must observe.
         max_error: root mean square reprojection error in pixels.
         max_turn: degrees by which the cameras may contradict the pairs that link them.
+        max_flat: share of a pair's matches that one homography may explain.
     """
 
     min_views: int
@@ -37,6 +38,7 @@ class Limits:
     min_baseline: float = 0.02
     min_points: int = 12
     max_turn: float = 10.0
+    max_flat: float = 0.9
 
 
 def least_views(count: int, fraction: float) -> int:
@@ -100,6 +102,12 @@ def standing_still(evidence: Evidence, count: int) -> str | None:
 
 def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | None:
     """Why a reconstruction can't be believed, or None. Small residuals alone prove nothing."""
+    if evidence.flat > limits.max_flat:
+        return (
+            "The photographs show no depth: "
+            f"{100 * evidence.flat:.0f} % of what they share moves as if painted on a flat board. "
+            "The camera was turned on the spot, or what it saw is flat."
+        )
     angle = float(np.median(solution.triangulation_angles())) if len(solution.points) else 0.0
     centres = solution.centres()
     baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()

@@ -161,6 +161,28 @@ def verify_pair(
     )
 
 
+def homography_share(
+    correspondences: Correspondences, inliers: npt.NDArray[np.int64], max_error: float, seed: int
+) -> float:
+    """Share of a pair's inliers that one homography explains within `max_error` pixels.
+
+    All of them: the camera only turned, or what it saw is flat; either way there is no depth.
+    """
+    pycolmap = quiet_pycolmap()
+    if len(inliers) < 8:
+        return 0.0
+    options = pycolmap.RANSACOptions()
+    options.max_error = max_error
+    options.max_num_trials = 1000
+    options.random_seed = seed
+    options.num_threads = 1
+    sampled = inliers[:MAX_SAMPLED_MATCHES]
+    found = pycolmap.estimate_homography_matrix(
+        correspondences.positions_i[sampled], correspondences.positions_j[sampled], options
+    )
+    return 0.0 if found is None else float(np.mean(np.asarray(found["inlier_mask"], bool)))
+
+
 def sampson_errors(
     essential: Array, matrix_i: Array, matrix_j: Array, positions_i: Array, positions_j: Array
 ) -> Array:

@@ -49,6 +49,7 @@ def match_features(
     place_b = np.ascontiguousarray(second.positions[index_b], np.float32)
     descriptors_a = first.descriptors[index_a]
     descriptors_b = second.descriptors[index_b]
+    norms_a, norms_b = ((d * d).sum(1) for d in (descriptors_a, descriptors_b))
 
     best_b = np.zeros(len(index_a), np.int32)  # for each row the most similar column
     similarity = np.zeros(len(index_a), np.float32)
@@ -61,7 +62,10 @@ def match_features(
         best_b[rows] = block.argmax(1)
         similarity[rows] = np.take_along_axis(block, best_b[rows, None].astype(np.int64), 1)[:, 0]
         _update_columns(block, start, best_a, best_a_similarity)
-        _stand_alone(block, best_b[rows], place_b, ratio, distinct_radius, alone[rows])
+        _stand_alone(
+            block, best_b[rows], norms_a[rows], norms_b, place_b, ratio, distinct_radius,
+            alone[rows],
+        )  # fmt: skip
 
     back = place_a[best_a[best_b]]
     mutual = np.linalg.norm(back - place_a, axis=1) < distinct_radius / 2
@@ -131,20 +135,23 @@ def _update_columns(block, start, best_row, best_value):  # type: ignore[no-unty
 
 
 @numba.njit(
-    "void(float32[:, ::1], int32[::1], float32[:, ::1], float64, float64, boolean[::1])",
+    "void(float32[:, ::1], int32[::1], float32[::1], float32[::1], float32[:, ::1], float64, "
+    "float64, boolean[::1])",
     cache=True,
     error_model="numpy",
 )
-def _stand_alone(block, best, places, ratio, radius, result):  # type: ignore[no-untyped-def]
-    """Ratio test of each row of a block of similarities [R, C] of descriptors of norm 512."""
-    norm = np.float32(512.0 * 512.0)
+def _stand_alone(  # type: ignore[no-untyped-def]
+    block, best, row_norms, column_norms, places, ratio, radius, result
+):
+    """Ratio test of each row of a block of products [R, C]; the norms are squared."""
     for row in range(block.shape[0]):
         winner = best[row]
-        # d^2 = 2 (1 - s): a rival at d > d_best / ratio has s below this limit.
-        limit = norm - (norm - block[row, winner]) / np.float32(ratio * ratio)
+        distance = row_norms[row] + column_norms[winner] - np.float32(2) * block[row, winner]
+        # A rival is nearer than distance / ratio: |a|^2 + |b|^2 - 2ab <= distance / ratio^2.
+        limit = row_norms[row] - distance / np.float32(ratio * ratio)
         alone = True
         for column in range(block.shape[1]):
-            if block[row, column] > limit:
+            if np.float32(2) * block[row, column] - column_norms[column] >= limit:
                 dx = places[column, 0] - places[winner, 0]
                 dy = places[column, 1] - places[winner, 1]
                 if dx * dx + dy * dy > radius * radius:

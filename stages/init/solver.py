@@ -19,8 +19,11 @@ Progress = Callable[[str, int, int], None]
 STARTS = (1.2, 2.0)
 #: Two starts that end further apart than this (relative) don't determine the focal length.
 SAME_FOCAL = 0.05
-#: EXIF is believed rather than a result that is further off than this (relative).
-EXIF_TOLERANCE = 0.15
+#: EXIF is believed rather than a result that is further off than this (relative): lens distortion,
+#: which our cameras don't have, pulls a free focal length away by about as much (castle: 6 %) ...
+EXIF_TOLERANCE = 0.05
+#: ... unless the reprojection error shrinks to this share: then the photograph was cropped.
+MUCH_BETTER = 0.75
 #: From this many views on one start does.
 MANY_VIEWS = 6
 
@@ -145,7 +148,12 @@ def known_focal(solver: Solver, free: bool, progress: Progress) -> Solution | No
         if max(drift) < EXIF_TOLERANCE:
             return refined
     fixed = solver.solve(focals, False)
-    return better(fixed, refined) if refined is not None and solver.sane(refined) else fixed
+    if refined is None or fixed is None or not solver.sane(refined):
+        return fixed
+    convincing = len(refined.poses) > len(fixed.poses) or (
+        len(refined.poses) == len(fixed.poses) and refined.error < MUCH_BETTER * fixed.error
+    )
+    return refined if convincing else fixed
 
 
 def unknown_focal(solver: Solver, free: bool, progress: Progress) -> tuple[Solution | None, bool]:

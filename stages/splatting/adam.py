@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting.threads import KERNELS
+
 Floats = npt.NDArray[np.float32]
 F = np.float32
 CHUNK = 256
@@ -16,7 +18,8 @@ CHUNK = 256
 @njit(parallel=True, cache=True, error_model="numpy")
 def adam_step(  # type: ignore[no-untyped-def]
     parameters: Floats, gradient: Floats, first: Floats, second: Floats, rates: Floats,
-    scale_first: float, scale_second: float, beta1: float, beta2: float, epsilon: float,
+    scale_first: np.float32, scale_second: np.float32, beta1: np.float32, beta2: np.float32,
+    epsilon: np.float32,
 ):  # fmt: skip
     """One step in place on [N, D]; `rates` [D]; `scale_*` = 1 / (1 - beta ** step)."""
     number, columns = parameters.shape
@@ -49,11 +52,12 @@ class Adam:
     def step(self, parameters: Floats, gradient: Floats, rates: Floats) -> None:
         """Move `parameters` in place."""
         self.steps += 1
-        adam_step(
-            parameters, gradient, self.first, self.second, rates,
-            F(1 / (1 - self.beta1**self.steps)), F(1 / (1 - self.beta2**self.steps)),
-            F(self.beta1), F(self.beta2), F(self.epsilon),
-        )  # fmt: skip
+        corrections = (F(1 / (1 - self.beta1**self.steps)), F(1 / (1 - self.beta2**self.steps)))
+        with KERNELS:
+            adam_step(
+                parameters, gradient, self.first, self.second, rates, *corrections,
+                F(self.beta1), F(self.beta2), F(self.epsilon),
+            )  # fmt: skip
 
     def select(self, source: npt.NDArray[np.int64], fresh: npt.NDArray[np.bool_]) -> None:
         """Rows follow `source` [N']; where `fresh` [N'] they start from zero."""

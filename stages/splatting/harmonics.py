@@ -83,7 +83,7 @@ def _basis_pullback(x, y, z, degree, g):  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, error_model="numpy")
 def features_forward(  # type: ignore[no-untyped-def]
     packed: Floats, degree: int, centre: Floats, screen: Floats, next_pose: Floats,
-    intrinsics: Floats, next_intrinsics: Floats, with_depth: int, with_flow: int, near: float,
+    intrinsics: Floats, next_intrinsics: Floats, with_depth: int, with_flow: int, near: np.float32,
     features: Floats,
 ):  # fmt: skip
     """Colour, then depth, then flow of the visible Gaussians.
@@ -137,7 +137,7 @@ def features_forward(  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, error_model="numpy")
 def features_backward(  # type: ignore[no-untyped-def]
     packed: Floats, degree: int, centre: Floats, pose: Floats, screen: Floats, next_pose: Floats,
-    next_intrinsics: Floats, with_depth: int, with_flow: int, near: float, features: Floats,
+    next_intrinsics: Floats, with_depth: int, with_flow: int, near: np.float32, features: Floats,
     screen_gradient: Floats, gradient: Floats, camera_parts: Floats, next_parts: Floats,
 ):  # fmt: skip
     """Gradient of `features_forward`; runs after `project_backward`, to which it adds.

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting.threads import KERNELS
+
 Floats = npt.NDArray[np.float32]
 F = np.float32
 HALF = 5
@@ -66,7 +68,7 @@ def ssim_forward(  # type: ignore[no-untyped-def]
                     for x in range(width):
                         across[j, row, x] += w * padded[j, x + k]
         moments = np.zeros((5, width), np.float32)
-        total = total_l1 = total_square = 0.0
+        sums[job, 0] = sums[job, 1] = sums[job, 2] = 0.0
         for row in range(y1 - y0):
             y = y0 + row
             for j in range(maps):
@@ -84,7 +86,7 @@ def ssim_forward(  # type: ignore[no-untyped-def]
                 for x in range(width):
                     target_mean[channel, y, x] = moments[3, x]
                     target_square[channel, y, x] = moments[4, x]
-            row_ssim = row_l1 = row_square = F(0)
+            row_ssim, row_l1, row_square = F(0), F(0), F(0)
             for x in range(width):
                 m = mask[y, x]
                 m1, m2 = moments[0, x], moments[3, x]
@@ -109,18 +111,15 @@ def ssim_forward(  # type: ignore[no-untyped-def]
                 row_ssim += m * ssim
                 row_l1 += m * abs(error)
                 row_square += m * error * error
-            total += row_ssim
-            total_l1 += row_l1
-            total_square += row_square
-        sums[job, 0] = total
-        sums[job, 1] = total_l1
-        sums[job, 2] = total_square
+            sums[job, 0] += row_ssim
+            sums[job, 1] += row_l1
+            sums[job, 2] += row_square
 
 
 @njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
 def ssim_backward(  # type: ignore[no-untyped-def]
     image: Floats, target: Floats, mask: Floats, d_mean: Floats, d_square: Floats,
-    d_product: Floats, l1_weight: float, ssim_weight: float, d_image: Floats,
+    d_product: Floats, l1_weight: np.float32, ssim_weight: np.float32, d_image: Floats,
 ):  # fmt: skip
     """Gradient of l1_weight * sum|x - y| - ssim_weight * sum(SSIM) into `d_image` [>= 3, H, W]."""
     height, width = mask.shape
@@ -183,7 +182,11 @@ class ColourLoss:
 
     def __call__(self, image: Floats, lambda_dssim: float) -> ColourLossResult:
         """Loss, its gradient, PSNR and SSIM for an image [>= 3, H, W]."""
-        height, width = self.mask.shape
+        with KERNELS:
+            return self._compare(image, lambda_dssim)
+
+    def _compare(self, image: Floats, lambda_dssim: float) -> ColourLossResult:
+        height = self.mask.shape[0]
         known = self._moments is not None
         if self._moments is None:
             self._moments = (np.empty_like(self.target), np.empty_like(self.target))

@@ -69,7 +69,7 @@ def _slope_limits(intrinsics, width, height):  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_forward(  # type: ignore[no-untyped-def]
     packed: Floats, pose: Floats, intrinsics: Floats, width: int, height: int,
-    near: float, low_pass: float, alpha_cut: float, screen: Floats,
+    near: np.float32, low_pass: np.float32, alpha_cut: np.float32, screen: Floats,
 ):  # fmt: skip
     """Project every Gaussian; fills `screen` [N, 9].
 

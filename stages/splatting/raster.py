@@ -52,13 +52,15 @@ def _exp2(x):  # type: ignore[no-untyped-def]
     power = F(0.99999741) + part * (
         F(0.69303020) + part * (F(0.23934107) + part * (F(0.053074066) + part * F(0.0067670840)))
     )
-    return power * _float_from_bits(I((whole + I(127)) << I(23)))
+    bits = I((whole + I(127)) << I(23))
+    return power * _float_from_bits(bits)  # type: ignore[call-arg]  # numba passes the context
 
 
 @njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
 def composite_forward(  # type: ignore[no-untyped-def]
     tiles_x: int, tiles_y: int, stride: int, offsets: Ints, members: Ints, screen: Floats,
-    features: Floats, alpha_cut: float, image: Floats, transmittance: Floats, stop: Ints, end: Ints,
+    features: Floats, alpha_cut: np.float32, image: Floats, transmittance: Floats, stop: Ints,
+    end: Ints,
 ):  # fmt: skip
     """Composite front to back.
 
@@ -108,7 +110,7 @@ def composite_forward(  # type: ignore[no-untyped-def]
             c0, c1, c2 = features[i, 0], features[i, 1], features[i, 2]
             here = I(k)
             for r in range(
-                max(0, int(math.ceil(my - reach))), min(rows - 1, int(math.floor(my + reach))) + 1
+                max(0, math.ceil(my - reach)), min(rows - 1, math.floor(my + reach)) + 1
             ):
                 dy = F(r) - my
                 cyy = c * dy * dy
@@ -156,7 +158,7 @@ def composite_forward(  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
 def composite_backward(  # type: ignore[no-untyped-def]
     tiles_x: int, tiles_y: int, stride: int, offsets: Ints, members: Ints, screen: Floats,
-    features: Floats, alpha_cut: float, transmittance: Floats, stop: Ints, end: Ints,
+    features: Floats, alpha_cut: np.float32, transmittance: Floats, stop: Ints, end: Ints,
     d_image: Floats, d_transmittance: Floats, slot_gradient: Floats,
 ):  # fmt: skip
     """Gradient of `composite_forward`, back to front.
@@ -217,7 +219,7 @@ def composite_backward(  # type: ignore[no-untyped-def]
                 for x in range(TILE):
                     extra_sums[e, x] = F(0)
             for r in range(
-                max(0, int(math.ceil(my - reach))), min(rows - 1, int(math.floor(my + reach))) + 1
+                max(0, math.ceil(my - reach)), min(rows - 1, math.floor(my + reach)) + 1
             ):
                 dy = F(r) - my
                 cyy = c2 * dy * dy

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -25,7 +24,10 @@ from stages.splatting.projection import (
     project_forward,
 )
 from stages.splatting.raster import composite_backward, composite_forward, gather, tile_stride
+from stages.splatting.threads import KERNELS, use_threads
 from stages.splatting.tiles import TILE, count_tiles, fill_tiles, order_by_depth
+
+__all__ = ["Gradients", "Rendering", "Viewpoint", "pack", "rasterize", "unpack", "use_threads"]
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -35,12 +37,6 @@ F = np.float32
 LOW_PASS = 0.3
 #: alpha below which a contribution is left out (3DGS). Tests against finite differences lower it.
 ALPHA_CUT = 1 / 255
-
-
-def use_threads(threads: int | None) -> None:
-    """Let the kernels of this process use `threads` threads (None: all there are)."""
-    available = numba.config.NUMBA_NUM_THREADS
-    numba.set_num_threads(max(1, min(threads or available, available)))
 
 
 @dataclass(frozen=True)
@@ -173,6 +169,10 @@ class Rendering:
             d_planes: [C, H, W] float32 contiguous, gradient of `planes`.
             d_transmittance: [H, W] float32.
         """
+        with KERNELS:
+            return self._backward(d_planes, d_transmittance)
+
+    def _backward(self, d_planes: Floats, d_transmittance: Floats) -> Gradients:
         f = self._forward
         view, after = f.viewpoint, f.following
         width = SCREEN_GRADIENTS + len(self.planes)
@@ -246,6 +246,20 @@ def rasterize(
         )
     if packed.shape[1] < HARMONICS + 3 * (degree + 1) ** 2:
         raise ValueError(f"degree {degree} needs more columns than packed {packed.shape} has")
+    with KERNELS:
+        return _rasterize(packed, viewpoint, degree, near, depth, flow_to, low_pass, alpha_cut)
+
+
+def _rasterize(
+    packed: Floats,
+    viewpoint: Viewpoint,
+    degree: int,
+    near: float,
+    depth: bool,
+    flow_to: Viewpoint | None,
+    low_pass: float,
+    alpha_cut: float,
+) -> Rendering:
     count = len(packed)
     width, height = viewpoint.width, viewpoint.height
     near32, cut = F(near), F(alpha_cut)

@@ -44,7 +44,7 @@ def _touches(dx0, dx1, dy0, dy1, a, b, c, reach):  # type: ignore[no-untyped-def
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def count_tiles(  # type: ignore[no-untyped-def]
-    screen: Floats, tiles_x: int, tiles_y: int, alpha_cut: float, bounds: Ints, count: Ints
+    screen: Floats, tiles_x: int, tiles_y: int, alpha_cut: np.float32, bounds: Ints, count: Ints
 ):
     """Bounds [N, 4] (x from, x to, y from, y to; in tiles) and number of tiles touched [N].
 

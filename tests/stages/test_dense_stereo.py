@@ -198,6 +198,15 @@ def test_depth_range_holds_the_scene_though_sparse_points_have_outliers(three):
     assert depths[1].min() * 0.5 < 1 / near < depths[1].min()
 
 
+def test_memory_is_bounded_by_fewer_planes(three):
+    cameras, images, depths, sparse, _, _ = three
+    small = replace(OPTIONS, max_volume=24 * 128 * 96)
+    found = dense_depths(images, everywhere(images), cameras, sparse, small, 2)
+    coarse = replace(OPTIONS, planes=24, max_planes=24)
+    assert same(found, dense_depths(images, everywhere(images), cameras, sparse, coarse, 2))
+    assert np.median(relative_error(found[1], depths[1])) < 0.01
+
+
 def test_wrong_input_is_refused(three):
     cameras, images, _, sparse, _, _ = three
     with pytest.raises(ValueError, match="per view"):

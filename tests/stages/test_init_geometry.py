@@ -111,7 +111,7 @@ def test_random_matches_are_not_believed():
 def test_coherence_tells_matches_that_move_alone():
     grid = np.stack(np.meshgrid(np.arange(0, 200, 20.0), np.arange(0, 200, 20.0)), -1)
     grid = grid.reshape(-1, 2)
-    moved = grid + (30, 2)
+    moved = grid + np.array([30, 2])
     moved[17] += (0, 60)
     coherent = coherent_matches(grid, moved, 40.0)
     assert not coherent[17]
@@ -175,9 +175,13 @@ def test_threads_change_nothing(tmp_path):
     assert first[0].focals == second[0].focals
 
 
-def test_a_known_focal_length_is_kept_where_results_drift_from_it(tmp_path):
-    given, _ = make_scene([-15, 0, 15], count=200)
-    for known, expected in ((FOCAL * 1.03, FOCAL), (FOCAL * 1.4, FOCAL * 1.4)):
+def test_a_known_focal_length_is_refined_and_left_only_for_a_good_reason(tmp_path):
+    weak, strong = (make_scene(yaws, count=200)[0] for yaws in ([-3, 0, 3], [-25, 0, 25]))
+    for given, known, expected in (
+        (strong, FOCAL * 1.03, FOCAL),
+        (strong, FOCAL * 1.8, FOCAL),  # as in a cropped photograph
+        (weak, FOCAL * 1.8, FOCAL * 1.8),
+    ):
         lens = replace(given.lenses[0], focal=known)
         solver = Solver(replace(given, lenses=[lens]), ClassicalOptions(), 1.0, 0, 1, tmp_path)
         solution = known_focal(solver, True, lambda *_: None)

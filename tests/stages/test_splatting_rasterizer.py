@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.splatting.rasterizer import Viewpoint, rasterize, use_threads
+from stages.splatting.rasterizer import Viewpoint, rasterize
 
 WIDTH, HEIGHT = 40, 28
 INTRINSICS = (38.0, 36.0, 19.0, 15.0)
@@ -74,7 +74,7 @@ def project(points: torch.Tensor, pose: torch.Tensor, k: torch.Tensor) -> tuple:
 
 def reference(packed, pose, k, degree, next_pose, next_k, alpha_cut):
     """[6, H, W] colour, depth, flow and [H, W] transmittance; one Gaussian after the other."""
-    fx, fy, cx, cy = k
+    fx, fy = k[:2]
     local, centre = project(packed[:, :3], pose, k)
     _, next_centre = project(packed[:, :3], next_pose, next_k)
     x, y, z = local.unbind(1)

@@ -18,6 +18,8 @@ class DenseOptions:
         method: ``"sweep"`` (plane sweep), the only one.
         planes: least number of depth hypotheses per view.
         max_planes: most; between the two the step is `step_px` in the farthest source.
+        max_volume: pixels times planes that one cost volume may have; two volumes of 4 bytes each
+            are in memory at a time. Large images get fewer planes, down to 16.
         step_px: how far one plane step moves the match, in pixels.
         window: side of the matching window in pixels, odd.
         p1, p2: semi-global penalties for a change by one plane, and by more.
@@ -37,7 +39,8 @@ class DenseOptions:
 
     method: str = "sweep"
     planes: int = 64
-    max_planes: int = 128
+    max_planes: int = 192
+    max_volume: int = 64_000_000
     step_px: float = 0.75
     window: int = 5
     p1: float = 0.08

@@ -134,7 +134,9 @@ def _sweep_view(
         return empty, empty
     lenses = [cameras[k] for k in chosen]
     ends = inverse_depth_range(camera, points, everything, options.range_margin)
-    planes = plane_count(camera, lenses, ends, options.step_px, options.planes, options.max_planes)
+    most = min(options.max_planes, max(options.max_volume // (camera.height * camera.width), 16))
+    least = min(options.planes, most)
+    planes = plane_count(camera, lenses, ends, options.step_px, least, most)
     inverse = np.linspace(ends[0], ends[1], planes)
     stack, sizes = stack_sources([grays[k] for k in chosen], [usable[k] for k in chosen])
     volume = cost_volume(

@@ -21,7 +21,7 @@ UNUSABLE = np.float32(-1e6)
 #: Cost where nothing can be compared: that of no correlation, so that it prefers no depth.
 NEUTRAL_COST = np.float32(1.0)
 #: Rows that one task sweeps: its part of the cost volume stays in the cache.
-_BAND = 8
+_BAND = 16
 
 
 def plane_homographies(

@@ -1,0 +1,23 @@
+"""Threads of the kernels: how many, how they wait, and one caller at a time."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import numba
+from numba.core import config
+
+# An OpenMP barrier spins: beside other busy processes that made a fit five times slower than
+# sleeping threads do. It has to be chosen before the first parallel kernel runs.
+if "NUMBA_THREADING_LAYER" not in os.environ:
+    config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
+
+#: The work queue takes one caller at a time; whoever launches kernels holds this lock.
+KERNELS = threading.RLock()
+
+
+def use_threads(threads: int | None) -> None:
+    """Let the kernels of this process use `threads` threads (None: all there are)."""
+    available = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    numba.set_num_threads(max(1, min(threads or available, available)))
