@@ -77,8 +77,8 @@ def automatic(views: int) -> dict[str, Any]:
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
         "lambda_depth": 0.5,
-        "pose_lr_init": 1e-3,
-        "pose_lr_final": 1e-5,
+        "pose_lr_init": 3e-4,
+        "pose_lr_final": 3e-6,
     }
 
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
-from stages.init.blas import one_blas_thread
 from stages.init.features import Features, detect_features, merge_points, squeezed
 from stages.init.matching import candidate_pairs, match_features, overlap_counts, select_pairs
 
@@ -60,7 +60,7 @@ def test_matches_are_the_true_ones():
 def test_matches_do_not_depend_on_block_or_blas_threads(monkeypatch):
     first, second, _ = pair_of_views(400, 200, noise=12)
     expected = match_features(first, second)
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         np.testing.assert_array_equal(match_features(first, second), expected)
     monkeypatch.setattr("stages.init.matching.BLOCK_ROWS", 37)
     np.testing.assert_array_equal(match_features(first, second), expected)
