@@ -11,7 +11,11 @@ a fall in zmm (AVX-512) or ymm (AVX2).
 from __future__ import annotations
 
 import argparse
+import os
 import re
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 
@@ -53,6 +57,23 @@ def measure(work: Callable[[], object], repetitions: int) -> float:
     return 1e3 * float(np.median(times))
 
 
+def time_parts(
+    packed: np.ndarray, viewpoint: Viewpoint, loss: ColourLoss, adam: Adam, repetitions: int
+) -> list[float]:
+    """Milliseconds of forward, backward, loss and Adam."""
+    rendering = rasterize(packed, viewpoint, degree=1, near=0.1)
+    gradient = loss(rendering.planes, 0.2).gradient
+    nothing = np.zeros((HEIGHT, WIDTH), np.float32)
+    by_scene = rendering.backward(gradient, nothing).packed
+    still = np.zeros(packed.shape[1], np.float32)
+    return [
+        measure(lambda: rasterize(packed, viewpoint, degree=1, near=0.1), repetitions),
+        measure(lambda: rendering.backward(gradient, nothing), repetitions),
+        measure(lambda: loss(rendering.planes, 0.2), repetitions),
+        measure(lambda: adam.step(packed, by_scene, still), repetitions),
+    ]
+
+
 def table(counts: list[int], threads: list[int], repetitions: int) -> None:
     camera = Camera("000", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, np.eye(4))
     viewpoint = Viewpoint.of(camera)
@@ -65,17 +86,8 @@ def table(counts: list[int], threads: list[int], repetitions: int) -> None:
         adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
         for number in threads:
             use_threads(number)
+            parts = time_parts(packed, viewpoint, loss, adam, repetitions)
             rendering = rasterize(packed, viewpoint, degree=1, near=0.1)
-            gradient = loss(rendering.planes, 0.2).gradient
-            nothing = np.zeros((HEIGHT, WIDTH), np.float32)
-            by_scene = rendering.backward(gradient, nothing).packed
-            still = np.zeros(packed.shape[1], np.float32)
-            parts = [
-                measure(lambda p=packed: rasterize(p, viewpoint, degree=1, near=0.1), repetitions),
-                measure(lambda r=rendering, g=gradient: r.backward(g, nothing), repetitions),
-                measure(lambda r=rendering: loss(r.planes, 0.2), repetitions),
-                measure(lambda p=packed, g=by_scene: adam.step(p, g, still), repetitions),
-            ]
             cells = [f"{count:>12}{number:>12}{rendering.intersections:>12}"]
             print("".join([*cells, *(f"{part:>12.2f}" for part in (*parts, sum(parts)))]))
 
@@ -98,6 +110,12 @@ def main() -> None:
     parser.add_argument("--assembly", action="store_true")
     options = parser.parse_args()
     if options.assembly:
+        if "NUMBA_CACHE_DIR" not in os.environ:
+            # there is no assembly to look at in cached code: compile anew, in a process of its own
+            with tempfile.TemporaryDirectory() as folder:
+                environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+                subprocess.run([sys.executable, *sys.argv], env=environment, check=True)
+            return
         assembly()
     else:
         table(options.gaussians, options.threads, options.repetitions)

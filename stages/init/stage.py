@@ -12,32 +12,76 @@ from pipeline.artifacts.pointmaps import Pointmaps
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
+from stages.init.dense.options import DenseOptions
+
+#: Dense stereo's defaults are said once, where they were measured.
+DENSE = DenseOptions()
 
 
 class DenseConfig(StageConfig):
     """Dense stereo."""
 
     method: Literal["sweep"] = Field("sweep", description="plane sweep with semi-global matching")
-    planes: int = Field(64, ge=8, le=512, description="least number of depths tried per pixel")
-    max_planes: int = Field(128, ge=8, le=1024, description="largest number of depths tried")
-    step_px: float = Field(0.75, gt=0, le=8, description="shift of a match from depth to depth, px")
-    window: int = Field(5, ge=3, le=31, description="side of the matching window, px, odd")
-    p1: float = Field(0.08, ge=0, le=10, description="penalty for a depth change by one step")
-    p2: float = Field(0.8, ge=0, le=100, description="penalty for a larger depth change")
-    sources: int = Field(4, ge=1, le=32, description="views that each view is compared with")
-    best_angle: float = Field(12, gt=0, le=90, description="triangulation angle wanted, degrees")
-    min_angle: float = Field(3, ge=0, le=90, description="least angle to a source view, degrees")
-    max_angle: float = Field(45, gt=0, le=120, description="largest angle to a source, degrees")
-    range_margin: float = Field(0.25, ge=0, le=5, description="share added to the depth range")
-    min_ncc: float = Field(0.3, ge=-1, le=1, description="least correlation of a kept depth")
-    relative_depth: float = Field(0.01, gt=0, le=0.5, description="depth agreement, relative")
-    reprojection_px: float = Field(1.5, gt=0, le=20, description="agreement in the image, px")
-    min_agreeing: int = Field(0, ge=0, le=32, description="views that must agree; 0: automatic")
-    front: float = Field(0.02, gt=0, le=1, description="depths this far in front are refuted")
-    speckle: int = Field(30, ge=0, le=100_000, description="smaller islands are dropped, pixels")
-    mask_highlights: bool = Field(True, description="keep highlights out of the matching")
-    fill: bool = Field(True, description="complete the depth where stereo knows nothing")
-    fill_reach_px: float = Field(80, gt=0, le=4096, description="reach of known depth into holes")
+    planes: int = Field(
+        DENSE.planes, ge=8, le=512, description="least number of depths tried per pixel"
+    )
+    max_planes: int = Field(
+        DENSE.max_planes, ge=8, le=1024, description="largest number of depths tried"
+    )
+    step_px: float = Field(
+        DENSE.step_px, gt=0, le=8, description="shift of a match from depth to depth, px"
+    )
+    window: int = Field(
+        DENSE.window, ge=3, le=31, description="side of the matching window, px, odd"
+    )
+    p1: float = Field(DENSE.p1, ge=0, le=10, description="penalty for a depth change by one step")
+    p2: float = Field(DENSE.p2, ge=0, le=100, description="penalty for a larger depth change")
+    sources: int = Field(
+        DENSE.sources, ge=1, le=32, description="views that each view is compared with"
+    )
+    best_angle: float = Field(
+        DENSE.best_angle, gt=0, le=90, description="triangulation angle wanted, degrees"
+    )
+    min_angle: float = Field(
+        DENSE.min_angle, ge=0, le=90, description="least angle to a source view, degrees"
+    )
+    max_angle: float = Field(
+        DENSE.max_angle, gt=0, le=120, description="largest angle to a source, degrees"
+    )
+    range_margin: float = Field(
+        DENSE.range_margin, ge=0, le=5, description="share added to the depth range"
+    )
+    min_ncc: float = Field(
+        DENSE.min_ncc, ge=-1, le=1, description="least correlation of a kept depth"
+    )
+    relative_depth: float = Field(
+        DENSE.relative_depth, gt=0, le=0.5, description="depth agreement, relative"
+    )
+    reprojection_px: float = Field(
+        DENSE.reprojection_px, gt=0, le=20, description="agreement in the image, px"
+    )
+    min_agreeing: int = Field(
+        DENSE.min_agreeing, ge=0, le=32, description="views that must agree; 0: automatic"
+    )
+    front: float = Field(
+        DENSE.front, gt=0, le=1, description="depths this far in front are refuted"
+    )
+    min_variance: float = Field(
+        DENSE.min_variance, ge=0, le=1, description="grey variance below which nothing is matched"
+    )
+    max_volume: int = Field(
+        DENSE.max_volume, ge=1_000_000, description="pixels times depths that are in memory at once"
+    )
+    speckle: int = Field(
+        DENSE.speckle, ge=0, le=100_000, description="smaller islands are dropped, pixels"
+    )
+    mask_highlights: bool = Field(
+        DENSE.mask_highlights, description="keep highlights out of the matching"
+    )
+    fill: bool = Field(DENSE.fill, description="complete the depth where stereo knows nothing")
+    fill_reach_px: float = Field(
+        DENSE.fill_reach_px, gt=0, le=4096, description="reach of known depth into holes"
+    )
 
 
 class InitConfig(StageConfig):
@@ -165,7 +209,7 @@ class InitStage(Stage):
 def _densify(context: StageContext, views: Views, attempt: Any) -> None:
     """Dense stereo from the cameras found, and everything written."""
     from stages.init import cloud
-    from stages.init.dense import DenseOptions, dense_depths
+    from stages.init.dense import dense_depths
     from stages.init.geometry import spanning_tree
     from stages.init.normalise import moved_points, moved_pose, world_similarity
 

@@ -85,11 +85,10 @@ def composite_forward(  # type: ignore[no-untyped-def]
         x0 = (tile % tiles_x) * TILE
         y0 = (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        left = np.ones((TILE, TILE), np.float32)
+        # one array: each further one costs the vectorised loop checks that they don't overlap
+        state = np.zeros((4, TILE, TILE), np.float32)  # colour, transmittance
+        state[3] = F(1)
         until = np.full((TILE, TILE), NEVER, np.int32)
-        red = np.zeros((TILE, TILE), np.float32)
-        green = np.zeros((TILE, TILE), np.float32)
-        blue = np.zeros((TILE, TILE), np.float32)
         extra = np.zeros((extras, TILE, TILE), np.float32)
         weights = np.zeros(TILE, np.float32)
         for r in range(TILE):
@@ -119,16 +118,16 @@ def composite_forward(  # type: ignore[no-untyped-def]
                     dx = F(x) - mx
                     alpha = min(opacity * _exp2(-(cyy + dx * (by + a * dx))), ALPHA_MAX)
                     alpha = alpha if alpha >= alpha_cut else F(0)
-                    before = left[r, x]
+                    before = state[3, r, x]
                     u = until[r, x]
                     u = u if before * (F(1) - alpha) >= TRANSMITTANCE_MIN else min(u, here)
                     until[r, x] = u
                     alpha = alpha if here < u else F(0)
                     w = alpha * before
-                    left[r, x] = before - w
-                    red[r, x] += w * c0
-                    green[r, x] += w * c1
-                    blue[r, x] += w * c2
+                    state[3, r, x] = before - w
+                    state[0, r, x] += w * c0
+                    state[1, r, x] += w * c1
+                    state[2, r, x] += w * c2
                     weights[x] = w
                 for e in range(extras):
                     value = features[i, 3 + e]
@@ -145,10 +144,10 @@ def composite_forward(  # type: ignore[no-untyped-def]
         end[tile] = k
         for r in range(rows):
             for x in range(columns):
-                image[0, y0 + r, x0 + x] = red[r, x]
-                image[1, y0 + r, x0 + x] = green[r, x]
-                image[2, y0 + r, x0 + x] = blue[r, x]
-                transmittance[y0 + r, x0 + x] = left[r, x]
+                image[0, y0 + r, x0 + x] = state[0, r, x]
+                image[1, y0 + r, x0 + x] = state[1, r, x]
+                image[2, y0 + r, x0 + x] = state[2, r, x]
+                transmittance[y0 + r, x0 + x] = state[3, r, x]
                 stop[y0 + r, x0 + x] = until[r, x]
             for e in range(extras):
                 for x in range(columns):
@@ -180,25 +179,21 @@ def composite_backward(  # type: ignore[no-untyped-def]
         x0 = (tile % tiles_x) * TILE
         y0 = (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        left = np.ones((TILE, TILE), np.float32)
+        # few arrays: each costs the vectorised loop checks that it overlaps no other
+        state = np.zeros((2, TILE, TILE), np.float32)  # transmittance, light from behind
         until = np.full((TILE, TILE), I(-1), np.int32)
-        behind = np.zeros((TILE, TILE), np.float32)
-        d_red = np.zeros((TILE, TILE), np.float32)
-        d_green = np.zeros((TILE, TILE), np.float32)
-        d_blue = np.zeros((TILE, TILE), np.float32)
+        d_colour = np.zeros((3, TILE, TILE), np.float32)
         d_extra = np.zeros((extras, TILE, TILE), np.float32)
-        sums = np.zeros((8, TILE), np.float32)
+        sums = np.zeros((10, TILE), np.float32)  # 8 sums; gradient through extras; weights
         extra_sums = np.zeros((extras, TILE), np.float32)
-        through = np.zeros(TILE, np.float32)
-        weights = np.zeros(TILE, np.float32)
         for r in range(rows):
             for x in range(columns):
-                left[r, x] = transmittance[y0 + r, x0 + x]
+                state[0, r, x] = transmittance[y0 + r, x0 + x]
                 until[r, x] = stop[y0 + r, x0 + x]
-                behind[r, x] = left[r, x] * d_transmittance[y0 + r, x0 + x]
-                d_red[r, x] = d_image[0, y0 + r, x0 + x]
-                d_green[r, x] = d_image[1, y0 + r, x0 + x]
-                d_blue[r, x] = d_image[2, y0 + r, x0 + x]
+                state[1, r, x] = state[0, r, x] * d_transmittance[y0 + r, x0 + x]
+                d_colour[0, r, x] = d_image[0, y0 + r, x0 + x]
+                d_colour[1, r, x] = d_image[1, y0 + r, x0 + x]
+                d_colour[2, r, x] = d_image[2, y0 + r, x0 + x]
             for e in range(extras):
                 for x in range(columns):
                     d_extra[e, r, x] = d_image[3 + e, y0 + r, x0 + x]
@@ -226,12 +221,13 @@ def composite_backward(  # type: ignore[no-untyped-def]
                 b2y = b2 * dy
                 by = b * dy
                 cy = c * dy
-                for x in range(TILE):
-                    through[x] = F(0)
+                if extras > 0:
+                    for x in range(TILE):
+                        sums[8, x] = F(0)
                 for e in range(extras):
                     value = features[i, 3 + e]
                     for x in range(TILE):
-                        through[x] += value * d_extra[e, r, x]
+                        sums[8, x] += value * d_extra[e, r, x]
                 for x in range(TILE):
                     dx = F(x) - mx
                     raw = opacity * _exp2(-(cyy + dx * (b2y + a2 * dx)))
@@ -239,28 +235,31 @@ def composite_backward(  # type: ignore[no-untyped-def]
                     taken = (alpha >= alpha_cut) & (here < until[r, x])
                     alpha = alpha if taken else F(0)
                     inverse = F(1) / (F(1) - alpha)
-                    before = left[r, x] * inverse
+                    before = state[0, r, x] * inverse
                     along = (
-                        red * d_red[r, x] + green * d_green[r, x] + blue * d_blue[r, x] + through[x]
+                        red * d_colour[0, r, x]
+                        + green * d_colour[1, r, x]
+                        + blue * d_colour[2, r, x]
+                        + sums[8, x]
                     )
                     w = alpha * before
-                    rest = behind[r, x]
+                    rest = state[1, r, x]
                     ds = alpha * (rest * inverse - before * along)
                     ds = ds if raw <= ALPHA_MAX else F(0)
-                    behind[r, x] = rest + w * along
-                    left[r, x] = before
+                    state[1, r, x] = rest + w * along
+                    state[0, r, x] = before
                     sums[0, x] += ds
                     sums[1, x] += ds * dy
                     sums[2, x] += ds * dy * dy
                     sums[3, x] += abs(ds * (a * dx + by))
                     sums[4, x] += abs(ds * (cy + b * dx))
-                    sums[5, x] += w * d_red[r, x]
-                    sums[6, x] += w * d_green[r, x]
-                    sums[7, x] += w * d_blue[r, x]
-                    weights[x] = w
+                    sums[5, x] += w * d_colour[0, r, x]
+                    sums[6, x] += w * d_colour[1, r, x]
+                    sums[7, x] += w * d_colour[2, r, x]
+                    sums[9, x] = w
                 for e in range(extras):
                     for x in range(TILE):
-                        extra_sums[e, x] += weights[x] * d_extra[e, r, x]
+                        extra_sums[e, x] += sums[9, x] * d_extra[e, r, x]
             s = sy = syy = sx = sxx = sxy = abs_x = abs_y = s_red = s_green = s_blue = F(0)
             for x in range(TILE):
                 dx = F(x) - mx
