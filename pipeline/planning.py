@@ -216,7 +216,7 @@ def plan_stage(
         planned.reasons = (
             explain(current.manifest["key_material"], material, inputs)
             if current
-            else ["no result yet"]
+            else []
         )
         planned.resumable = store.has_checkpoint(name, key)
         if failure and failure.get("key") == key:

@@ -55,7 +55,7 @@ def print_summary(summary: RunSummary) -> None:
         if viewer.exists():
             console.print(f"Look at it: open {viewer} in a browser.", soft_wrap=True)
     else:
-        console.print(f"\nResults: {summary.workspace}/", soft_wrap=True)
+        console.print(f"\nResults: {summary.stages[-1].folder}/", soft_wrap=True)
 
 
 #: Figures that everybody asks for, by the names under which stages report them.

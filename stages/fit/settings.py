@@ -76,7 +76,8 @@ def automatic(views: int) -> dict[str, Any]:
         "rotation_lr": 1e-3 * rate,
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
-        "lambda_depth": 0.5,
+        # with many views the photographs know better than the points
+        "lambda_depth": 0.1 if many else 0.5,
         "pose_lr_init": 3e-4,
         "pose_lr_final": 3e-6,
     }
