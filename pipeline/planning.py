@@ -214,9 +214,7 @@ def plan_stage(
         current = store.current(name)
         planned.state = "stale" if current else "missing"
         planned.reasons = (
-            explain(current.manifest["key_material"], material, inputs)
-            if current
-            else []
+            explain(current.manifest["key_material"], material, inputs) if current else []
         )
         planned.resumable = store.has_checkpoint(name, key)
         if failure and failure.get("key") == key:
