@@ -40,12 +40,25 @@ def describe(figures: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def time_left(elapsed: float, done: int, total: int) -> str:
-    """An estimate from the pace so far, e.g. ``12 s left``; empty while nothing is known."""
-    if done <= 0 or total <= 0 or done >= total or elapsed < 1.0:
-        return ""
-    seconds = elapsed * (total - done) / done
-    return f"{seconds:.0f} s left" if seconds < 90 else f"{seconds / 60:.0f} min left"
+class Pace:
+    """Estimates the time left from how fast the step that is going on has gone so far."""
+
+    def __init__(self) -> None:
+        self._step: tuple[str, str] | None = None
+
+    def time_left(self, stage: str, step: str, done: int, total: int, now: float) -> str:
+        """E.g. ``12 s left``; empty while nothing is known.
+
+        Args:
+            now: a clock's seconds.
+        """
+        if self._step != (stage, step):
+            self._step, self._start, self._first = (stage, step), now, done
+        elapsed, gained = now - self._start, done - self._first
+        if gained <= 0 or done >= total or elapsed < 1.0:
+            return ""
+        seconds = elapsed * (total - done) / gained
+        return f"{seconds:.0f} s left" if seconds < 90 else f"{seconds / 60:.0f} min left"
 
 
 class LineReporter(Reporter):
@@ -55,8 +68,7 @@ class LineReporter(Reporter):
         self._stream = stream or sys.stderr
         self._interval = interval
         self._last = 0.0
-        self._step: tuple[str, str] = ("", "")
-        self._step_start = 0.0
+        self._pace = Pace()
 
     def _say(self, text: str) -> None:
         print(text, file=self._stream, flush=True)
@@ -68,12 +80,11 @@ class LineReporter(Reporter):
 
     def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
         now = time.monotonic()
-        if self._step != (stage, step):
-            self._step, self._step_start = (stage, step), now
+        left = self._pace.time_left(stage, step, done, total, now)
         if now - self._last < self._interval:
             return
         self._last = now
-        more = [describe(figures), time_left(now - self._step_start, done, total)]
+        more = [describe(figures), left]
         self._say(f"{stage}: {step} {done}/{total}" + "".join(f", {m}" for m in more if m))
 
     def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
@@ -105,8 +116,7 @@ class LiveReporter(Reporter):
             transient=True,
         )
         self._task: Any = None
-        self._step = ""
-        self._step_start = 0.0
+        self._pace = Pace()
 
     def start(self, stages: list[str]) -> None:
         self._display.start()
@@ -114,13 +124,10 @@ class LiveReporter(Reporter):
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
         text = "goes on from its checkpoint" if resumed else "; ".join(reasons)
         self._task = self._display.add_task(text, total=None, stage=stage)
-        self._step = ""
 
     def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
-        now = time.monotonic()
-        if step != self._step:
-            self._step, self._step_start = step, now
-        more = [describe(figures), time_left(now - self._step_start, done, total)]
+        left = self._pace.time_left(stage, step, done, total, time.monotonic())
+        more = [describe(figures), left]
         text = step + "".join(f" · {part}" for part in more if part)
         self._display.update(self._task, completed=done, total=total, description=text)
 

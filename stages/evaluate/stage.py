@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.views import Views, to_uint8, write_png
@@ -72,7 +72,8 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
 
     config: EvaluateConfig = context.config
     views: Views = context.load("views")
-    cameras: dict[str, Camera] = _by_name(context.load("cameras"))
+    placed_cameras: Cameras = context.load("cameras")
+    cameras = placed_cameras.by_name()
     gaussians: Gaussians = context.load("gaussians")
     placed = [view for view in views.views if view.name in cameras]
     unplaced = [view.name for view in views.views if view.name not in cameras]
@@ -133,7 +134,3 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
         coverage=round(mean["coverage"], 4),
         views=f"{len(figures)}/{len(views)}",
     )
-
-
-def _by_name(cameras: Cameras) -> dict[str, Camera]:
-    return cameras.by_name()

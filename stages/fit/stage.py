@@ -188,7 +188,7 @@ class FitStage(Stage):
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}
             context.progress("fit", iteration, settings.iterations, **figures)
 
-        context.progress("fit", 0, settings.iterations)
+        context.progress("preparing (a first run compiles its kernels)", 0, 1)
         result = fit(
             placed, [by_name[view.name] for view in placed], points, flow, settings,
             threads=context.threads, checkpoint=context.scratch / "fit.npz", report=report,

@@ -7,13 +7,17 @@ import io
 from rich.console import Console
 
 from pipeline import progress
-from pipeline.progress import LineReporter, LiveReporter, describe, time_left
+from pipeline.progress import LineReporter, LiveReporter, Pace, describe
 
 
 def test_time_left() -> None:
-    assert time_left(10, 50, 100) == "10 s left"
-    assert time_left(600, 50, 100) == "10 min left"
-    assert time_left(10, 0, 100) == time_left(10, 100, 100) == time_left(0.5, 1, 2) == ""
+    pace = Pace()
+    assert pace.time_left("fit", "steps", 10, 100, now=50.0) == ""  # nothing known yet
+    assert pace.time_left("fit", "steps", 20, 100, now=50.5) == ""  # too early to tell
+    assert pace.time_left("fit", "steps", 55, 100, now=60.0) == "10 s left"
+    assert pace.time_left("fit", "steps", 55, 100, now=650.0) == "10 min left"
+    assert pace.time_left("fit", "steps", 100, 100, now=700.0) == ""
+    assert pace.time_left("fit", "others", 55, 100, now=800.0) == ""  # another step
 
 
 def test_describe() -> None:

@@ -1,0 +1,182 @@
+"""What goes wrong at a user's desk: a clear paragraph, the right exit status, an unharmed cache."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline import cli
+
+SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
+PHOTOS = sorted(SAMPLES.glob("*.jpg"))
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace with a good result in it."""
+    folder = tmp_path_factory.mktemp("case") / "w"
+    pipeline.run(SAMPLES, workspace=folder, stages=["views"])
+    return folder
+
+
+def call(workspace: Path, *arguments: str) -> tuple[int, str]:
+    """Run the command line; returns exit status and the last paragraph on standard error.
+
+    Afterwards the good result must still be there.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "pipeline.cli", "run", *arguments, "-w", str(workspace)],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    summary = pipeline.run(SAMPLES, workspace=workspace, stages=["views"])
+    assert [stage.action for stage in summary.stages] == ["cached"]
+    return done.returncode, done.stderr.strip().rpartition("\n")[2]
+
+
+def two_and(folder: Path, name: str, content: bytes) -> Path:
+    """A folder with two good photographs and one more file."""
+    folder.mkdir(exist_ok=True)
+    for photo in PHOTOS[:2]:
+        shutil.copy(photo, folder)
+    (folder / name).write_bytes(content)
+    return folder
+
+
+def one_image(folder: Path) -> Path:
+    shutil.copy(PHOTOS[0], folder)
+    return folder
+
+
+def no_images(folder: Path) -> Path:
+    (folder / "notes.txt").write_text("no pictures here")
+    return folder
+
+
+def truncated(folder: Path) -> Path:
+    return two_and(folder, "cut.jpg", PHOTOS[2].read_bytes()[:9000])
+
+
+def text_as_jpg(folder: Path) -> Path:
+    return two_and(folder, "letter.jpg", b"Dear colleague, please find enclosed")
+
+
+def identical(folder: Path) -> Path:
+    shutil.copy(PHOTOS[0], folder / "a.jpg")
+    shutil.copy(PHOTOS[0], folder / "b.jpg")
+    return folder
+
+
+def ribbon(folder: Path) -> Path:
+    stripe = np.random.default_rng(0).integers(0, 255, (10, 20000, 3), np.uint8)
+    return two_and(folder, "ribbon.png", cv2.imencode(".png", stripe)[1].tobytes())
+
+
+def missing(folder: Path) -> Path:
+    return folder / "nowhere"
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (one_image, ["two"]),
+        (no_images, ["notes.txt"]),
+        (truncated, ["cut.jpg"]),
+        (text_as_jpg, ["letter.jpg"]),
+        (identical, ["a.jpg", "b.jpg"]),
+        (ribbon, ["ribbon.png", "20000"]),
+        (missing, ["nowhere"]),
+    ],
+)
+def test_unusable_photographs(
+    workspace: Path, tmp_path: Path, make: Callable[[Path], Path], words: list[str]
+) -> None:
+    status, paragraph = call(workspace, str(make(tmp_path)), "--stages", "views")
+    assert status == 2, paragraph
+    for word in words:
+        assert word in paragraph
+    assert len(paragraph) > 40  # what, where, and what to do
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--stages", "views,inti"), ["'inti'", "Did you mean 'init'?"]),
+        (("--set", "sap.quantile=7"), ["sap.quantile=7", "less than 1"]),
+        (("--set", "sap.quantil=0.9"), ["'sap.quantil'", "Did you mean 'quantile'?"]),
+        (("--set", "fit.iterations=none"), ["fit.iterations"]),
+        (("-c", "dentalsplatt"), ["Did you mean 'dentalsplat'?"]),
+        (("--frames", "-3"), ["views.frames"]),
+    ],
+)
+def test_wrong_request(workspace: Path, arguments: tuple[str, ...], words: list[str]) -> None:
+    status, paragraph = call(workspace, str(SAMPLES), *arguments)
+    assert status == 2, paragraph
+    for word in words:
+        assert word in paragraph
+
+
+def test_photographs_that_share_nothing(workspace: Path, tmp_path: Path) -> None:
+    """Exit status 3, and a diagnosis that names photographs and says what to do."""
+    random = np.random.default_rng(0)
+    for name in ("left.png", "front.png", "right.png"):
+        noise = cv2.resize(random.integers(0, 255, (48, 64, 3), np.uint8), (512, 384))
+        cv2.imwrite(str(tmp_path / name), noise)
+    status, paragraph = call(workspace, str(tmp_path))
+    assert status == 3, paragraph
+    assert ".png" in paragraph and "photograph" in paragraph
+
+
+def test_unreadable_folder(
+    workspace: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """In this process, since root may read every folder."""
+    closed = one_image(tmp_path)
+    scan = os.scandir
+
+    def refuse(folder: str | Path = ".") -> object:
+        if Path(folder) == closed:
+            raise PermissionError(13, "Permission denied", str(folder))
+        return scan(folder)
+
+    monkeypatch.setattr("os.scandir", refuse)
+    monkeypatch.setattr(sys, "argv", ["pipeline", "run", str(closed), "-w", str(workspace)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert str(closed) in message and "permission denied" in message
+
+
+def test_full_disk(tmp_path: Path) -> None:
+    """A real file system that is too small, then larger: the run goes on where it stopped."""
+    small = tmp_path / "small"
+    small.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(small)]
+    if subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("mounting a small file system needs root")
+    command = [
+        sys.executable, "-m", "pipeline.cli", "run", str(SAMPLES), "-w", str(small / "w"),
+        "--stages", "views",
+    ]  # fmt: skip
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 2, done.stderr
+        assert "is full" in done.stderr and "Nothing computed before is lost" in done.stderr
+        subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
+        again = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert again.returncode == 0, again.stderr
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
