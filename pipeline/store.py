@@ -43,6 +43,7 @@ from pipeline.files import (
 
 MANIFEST = "manifest.json"
 KEY_LENGTH = 12
+DISPLACED = ".replaced"
 
 
 class CorruptResultError(Exception):
@@ -192,12 +193,16 @@ class Store:
             listing = folder_listing(partial / kind)
             outputs[kind] = {"content": content_hash(listing), "files": listing}
         manifest = {"format": 1, "stage": stage, "key": key, **manifest, "outputs": outputs}
+        final = self.folder(stage, key)
+        before = read_json(final / MANIFEST)
+        if before is not None and before["outputs"] == outputs:  # forced, and the same bytes again
+            write_json(final / MANIFEST, manifest)
+            shutil.rmtree(partial)
+            return Result(stage, key, final, manifest)
         fsync_tree(partial)
         write_json(partial / MANIFEST, manifest)
-        final = self.folder(stage, key)
-        displaced = final.with_name(f"{final.name}.replaced")
-        if final.exists():
-            shutil.rmtree(displaced, ignore_errors=True)
+        displaced = final.with_name(f"{final.name}{DISPLACED}")
+        if final.exists():  # two folders can't change places in one step: `_recover` mends a kill
             final.rename(displaced)
         partial.rename(final)
         fsync_folder(final.parent)
@@ -265,10 +270,21 @@ class Store:
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             owner = {"pid": os.getpid(), "host": socket.gethostname(), "since": since}
             write_atomic(owner_file, json.dumps(owner) + "\n")
+            self._recover(folder)
             yield
         finally:
             owner_file.unlink(missing_ok=True)
             lock.release()
+
+    @staticmethod
+    def _recover(folder: Path) -> None:
+        """Undo what a kill between the two renames of a replacement left (see `commit`)."""
+        for displaced in folder.glob(f"*{DISPLACED}"):
+            final = displaced.with_name(displaced.name.removesuffix(DISPLACED))
+            if final.exists():
+                shutil.rmtree(displaced)
+            else:
+                displaced.rename(final)
 
     # -- cleaning --------------------------------------------------------------------------------
 
@@ -299,7 +315,7 @@ class Store:
     def _unused(self, folder: Path, keep: int) -> list[Path]:
         pointer = self.pointer(folder.name) or {"key": ""}
         entries = [path for path in folder.iterdir() if path.is_dir()]
-        whole = [path for path in entries if len(path.name) == KEY_LENGTH]
+        whole = [path for path in entries if (path / MANIFEST).is_file() and "." not in path.name]
         others = sorted(
             (path for path in whole if path.name != pointer["key"][:KEY_LENGTH]),
             key=lambda path: ((path / MANIFEST).stat().st_mtime_ns, path.name),

@@ -13,6 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import torch
+from kornia.geometry.conversions import (
+    quaternion_to_rotation_matrix,
+    rotation_matrix_to_quaternion,
+)
 
 from pipeline.artifacts.pointmaps import PointmapPair
 from stages.align.start import Start
@@ -38,22 +42,8 @@ class AlignOptions:
     free_poses: bool = True
 
 
-def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """[N, 3, 3] from quaternions wxyz [N, 4] of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)
-
-
 def _quats_wxyz(rotations: Sequence[Array]) -> torch.Tensor:
-    from scipy.spatial.transform import Rotation
-
-    xyzw = Rotation.from_matrix(np.stack(rotations)).as_quat()
-    return torch.tensor(np.roll(xyzw, 1, axis=1))
+    return rotation_matrix_to_quaternion(torch.tensor(np.stack(rotations)))
 
 
 def optimise(
@@ -131,8 +121,8 @@ def _optimise(
     optimiser = torch.optim.Adam(free, lr=options.learning_rate, betas=(0.9, 0.9))
 
     def objective() -> tuple[torch.Tensor, torch.Tensor]:
-        rotations = rotation_matrices(pose_q)
-        turned = rotation_matrices(pair_q)
+        rotations = quaternion_to_rotation_matrix(pose_q)
+        turned = quaternion_to_rotation_matrix(pair_q)
         # The gauge: mean log scale stays where the start had it.
         scales = torch.exp(pair_log - pair_log.mean() + mean_log)
         focals = torch.exp(log_focal + focal_change[:, None])
@@ -162,8 +152,8 @@ def _optimise(
             progress(step + 1, options.iterations, float(mean_distance.detach()))
     with torch.no_grad():
         _, mean_distance = objective()
-        rotations = rotation_matrices(pose_q).numpy()
-        turned = rotation_matrices(pair_q).numpy()
+        rotations = quaternion_to_rotation_matrix(pose_q).numpy()
+        turned = quaternion_to_rotation_matrix(pair_q).numpy()
         scales = torch.exp(pair_log - pair_log.mean() + mean_log).numpy()
         factor = torch.exp(focal_change).numpy()
     cameras = {}

@@ -1,0 +1,121 @@
+"""The store by itself: commits, replacements that a kill cut in two, leftovers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.artifacts.metrics import Metrics
+from pipeline.files import canonical_json, content_hash, folder_listing, read_json, write_json
+from pipeline.store import Result, Store
+
+KEY = "a" * 64
+FIGURES: dict[str, Any] = {"key_material": {}, "summary": {}, "warnings": []}
+
+
+def put(store: Store, value: int, key: str = KEY) -> Result:
+    folder = store.begin("fit", key)
+    (folder / "metrics").mkdir()
+    Metrics({"value": value}).save(folder / "metrics")
+    return store.commit("fit", key, dict(FIGURES), ["metrics"])
+
+
+def value_of(store: Store) -> int:
+    result = store.find("fit", KEY)
+    assert result is not None
+    value: int = store.load(result, "metrics").figures["value"]
+    return value
+
+
+def test_commit_is_found_and_loaded(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    assert store.find("fit", KEY) is None
+    put(store, 1)
+    assert value_of(store) == 1
+    assert not list(tmp_path.glob("fit/*.partial"))
+
+
+def test_replacement_has_the_new_bytes(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    put(store, 1)
+    assert value_of(store) == 1
+    put(store, 2)
+    assert value_of(store) == 2
+    assert [path.name for path in (tmp_path / "fit").iterdir()] == [KEY[:12]]
+
+
+def test_the_same_bytes_replace_only_the_manifest(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    file = put(store, 1).folder / "metrics" / "metrics.json"
+    before = file.stat().st_mtime_ns
+    put(store, 1)
+    assert file.stat().st_mtime_ns == before
+
+
+def test_kill_between_the_renames_of_a_replacement_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    put(store, 1)
+    rename = Path.rename
+
+    def killed(path: Path, target: Path) -> Path:
+        if path.name.endswith(".partial"):
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        put(store, 2)
+    monkeypatch.undo()
+    with store.lock("fit", print):
+        assert value_of(store) == 1
+
+
+def test_clean_removes_leftovers_of_every_kind(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with store.lock("fit", print):
+        store.use(put(store, 1))
+        put(store, 2, key="b" * 64)
+        (store.begin("fit", "c" * 64) / "scratch" / "checkpoint").write_text("half")
+        (tmp_path / "fit" / ("d" * 12)).mkdir()  # a result that lost its manifest
+    removed, _ = store.clean(keep=0)
+    assert sorted(removed) == [f"fit/{'b' * 12}", f"fit/{'c' * 12}.partial", f"fit/{'d' * 12}"]
+    assert value_of(store) == 1
+
+
+def test_content_hash_tells_names_and_bytes(tmp_path: Path) -> None:
+    hashes = set()
+    for index, (name, text) in enumerate([("a", "1"), ("b", "1"), ("a", "2"), ("sub/a", "1")]):
+        folder = tmp_path / str(index)
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_text(text)
+        hashes.add(content_hash(folder_listing(folder)))
+    assert len(hashes) == 4
+
+
+def test_unreadable_json_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'{"a": ')
+    assert read_json(tmp_path / "a.json") is None
+    assert read_json(tmp_path / "nothing.json") is None
+    write_json(tmp_path / "a.json", {"a": 1})
+    assert read_json(tmp_path / "a.json") == {"a": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=10,
+)  # fmt: skip
+
+
+@given(st.dictionaries(st.text(), VALUES))
+def test_canonical_json_does_not_depend_on_the_order_of_keys(tree: dict[str, Any]) -> None:
+    backwards = dict(reversed(list(tree.items())))
+    assert canonical_json(tree) == canonical_json(backwards)
