@@ -29,6 +29,8 @@ Floats = npt.NDArray[np.float32]
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
 EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
+#: a Gaussian with less than this share of its area inside the masks is a needle out of them
+MOSTLY_MASKED = 0.2
 
 
 @dataclass(frozen=True)
@@ -155,12 +157,19 @@ def chosen_flows(
 
 
 def worth_keeping(trainer: Trainer, positions: Array) -> npt.NDArray[np.bool_]:
-    """[N] False for Gaussians that colour nothing, and for those right before a lens."""
+    """[N] False for Gaussians that colour nothing, and for those right before a lens.
+
+    What a Gaussian colours outside the masks, no photograph has a say in: one that does mostly
+    that is a needle that has grown into the masked part.
+    """
     settings = trainer.settings
-    most = np.zeros(len(trainer.packed), np.float32)
+    most, everywhere, within = np.zeros((3, len(trainer.packed)), np.float32)
     viewpoints, nearest = [], []
     for view, target in enumerate(trainer.targets):
-        most = np.maximum(most, contribution(trainer.render(view)))
+        area, masked_area = contribution(trainer.render(view), target[1].colour.mask)
+        most = np.maximum(most, masked_area)
+        everywhere += area
+        within += masked_area
         viewpoint = trainer.viewpoint(view, target[1])
         local = positions @ viewpoint.pose[:, :3].T.astype(np.float64) + viewpoint.pose[:, 3]
         fx, fy, cx, cy = viewpoint.intrinsics
@@ -172,6 +181,6 @@ def worth_keeping(trainer: Trainer, positions: Array) -> npt.NDArray[np.bool_]:
         limit = float(np.quantile(depths, 0.01)) if len(depths) else 0.0
         viewpoints.append(viewpoint)
         nearest.append(settings.final_prune_near * limit)
-    keep = most >= settings.final_prune_contribution
+    keep = (most >= settings.final_prune_contribution) & (within >= MOSTLY_MASKED * everywhere)
     keep &= trainer.packed[:, 10] > logit(settings.prune_opacity)
     return np.asarray(keep & ~before_lens(trainer.packed, viewpoints, nearest))

@@ -14,12 +14,22 @@ Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 
-def contribution(rendering: Rendering) -> Floats:
-    """[N] sum over the pixels of each Gaussian's blending weight: the area that it colours, px."""
-    ones = np.zeros_like(rendering.planes)
-    ones[0] = 1
-    gradients = rendering.backward(ones, np.zeros_like(rendering.transmittance))
-    return np.ascontiguousarray(gradients.features[:, 0])
+def contribution(rendering: Rendering, mask: Floats) -> tuple[Floats, Floats]:
+    """Sum over pixels of each Gaussian's blending weight: the area that it colours, in pixels.
+
+    Args:
+        rendering: of one view.
+        mask: [H, W] float32, 1 where the view's photograph may be used.
+
+    Returns:
+        [N] over the whole image, and [N] inside the mask only.
+    """
+    per_pixel = np.zeros_like(rendering.planes)
+    per_pixel[0] = 1
+    per_pixel[1] = mask
+    gradients = rendering.backward(per_pixel, np.zeros_like(rendering.transmittance))
+    areas = gradients.features
+    return np.ascontiguousarray(areas[:, 0]), np.ascontiguousarray(areas[:, 1])
 
 
 def before_lens(packed: Floats, viewpoints: Sequence[Viewpoint], nearest: Sequence[float]) -> Bools:
