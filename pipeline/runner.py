@@ -126,8 +126,8 @@ def run(
     """Run the pipeline on photographs, reusing every result that is still valid.
 
     Args:
-        images: a folder, files, a glob pattern or one video; empty to use what the workspace was
-            last run on.
+        images: a folder, files, a glob pattern or one video; empty to take the `views` that the
+            workspace holds as they are.
         workspace: where results are kept; default ``./runs/<name of the input>``.
         preset: name or YAML file of a preset.
         overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.

@@ -24,6 +24,9 @@ class AlignConfig(StageConfig):
     learning_rate: float = Field(
         0.01, gt=0, le=1, description="At the start; falls to 1e-6 along a cosine."
     )
+    refine_learning_rate: float = Field(
+        0.001, gt=0, le=1, description="The same, where given cameras are refined."
+    )
     samples: int = Field(
         3000, ge=100, le=10_000_000, description="Pixels per view in the global alignment."
     )
@@ -64,7 +67,7 @@ class AlignStage(Stage):
     requires = ("views", "pointmaps")
     optional = ("cameras",)
     provides = ("cameras", "points")
-    libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "torch")
+    libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "torch", "kornia")
 
     def run(self, context: StageContext) -> None:
         import numpy as np
@@ -105,7 +108,9 @@ class AlignStage(Stage):
 
             options = AlignOptions(
                 iterations=config.iterations,
-                learning_rate=config.learning_rate * (0.1 if given is not None else 1.0),
+                learning_rate=config.learning_rate
+                if given is None
+                else config.refine_learning_rate,
                 samples=config.samples,
                 free_focals=config.free_focals and given is None,
             )

@@ -18,7 +18,7 @@ from pipeline.stage import Stage, StageConfig, StageContext
 Channel = Annotated[float, Field(ge=0, le=1)]
 
 #: The input views trained the scene, so that their figures say nothing about unseen views.
-PROTOCOL = "input views (training views), 8-bit images, cameras as refined by the fit"
+PROTOCOL = "input views (training views), 8-bit images, registered cameras"
 
 
 class EvaluateConfig(StageConfig):

@@ -29,8 +29,6 @@ Floats = npt.NDArray[np.float32]
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
 EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
-#: a Gaussian with less than this share of its area inside the masks is a needle out of them
-MOSTLY_MASKED = 0.2
 
 
 @dataclass(frozen=True)
@@ -181,6 +179,8 @@ def worth_keeping(trainer: Trainer, positions: Array) -> npt.NDArray[np.bool_]:
         limit = float(np.quantile(depths, 0.01)) if len(depths) else 0.0
         viewpoints.append(viewpoint)
         nearest.append(settings.final_prune_near * limit)
-    keep = (most >= settings.final_prune_contribution) & (within >= MOSTLY_MASKED * everywhere)
+    keep = (most >= settings.final_prune_contribution) & (
+        within >= settings.final_prune_masked * everywhere
+    )
     keep &= trainer.packed[:, 10] > logit(settings.prune_opacity)
     return np.asarray(keep & ~before_lens(trainer.packed, viewpoints, nearest))

@@ -52,6 +52,7 @@ class FitSettings:
     prune_opacity: float
     final_prune_contribution: float
     final_prune_near: float
+    final_prune_masked: float
     near: float
     background: tuple[float, float, float]
     seed: int

@@ -124,6 +124,12 @@ class FitConfig(StageConfig):
         ge=0,
         lt=1,
     )
+    final_prune_masked: float = number(
+        0.2,
+        "finally remove Gaussians with less than this share of their area inside the masks",
+        ge=0,
+        le=1,
+    )
     near: float = number(0.05, "near plane, as a share of the scene's median depth", gt=0)
     background: tuple[float, float, float] = number(
         (0.0, 0.0, 0.0), "colour behind everything, sRGB 0..1"

@@ -117,7 +117,8 @@ class Trainer:
         coarse = self.iteration <= s.coarse_fraction * s.iterations
         target = self.targets[view][s.coarse_factor if coarse else 1]
         flow = target.flow if s.lambda_flow > 0 else None
-        # the depth prior on every other iteration: it costs a channel and changes slowly
+        # the depth prior on every other iteration, twice as heavy: it costs a channel and changes
+        # slowly
         with_depth = s.lambda_depth > 0 and self.iteration % 2 == 0 and bool(target.depth.any())
         following = None
         if flow is not None:

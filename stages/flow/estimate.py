@@ -22,9 +22,6 @@ _DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 
-#: Weight of the smoothness in DIS's variational refinement (OpenCV's default is 20).
-_DIS_SMOOTHNESS = 40.0
-
 #: Smallest image side that the pyramid of the flow methods works on.
 _SMALLEST_SIDE = 16
 
@@ -85,6 +82,7 @@ def estimate_flow(
     method: Method = "dis",
     preset: Preset = "medium",
     finest_scale: int = 0,
+    smoothness: float = 40.0,
 ) -> tuple[Array, Array]:
     """Estimate the flow from image i to image j, beginning with a guess.
 
@@ -98,6 +96,7 @@ def estimate_flow(
         method: ``"dis"`` (Kroeger et al., ECCV 2016) or ``"farneback"`` (Farnebäck, SCIA 2003).
         preset: effort of DIS.
         finest_scale: pyramid level at which DIS stops; 0 is full size.
+        smoothness: weight of the smoothness in DIS's variational refinement.
 
     Returns:
         The flow [H_i, W_i, 2] and the residual r [H_i, W_i, 2], float32 pixels.
@@ -108,14 +107,15 @@ def estimate_flow(
     if shrink > 1.2:  # sampling a larger image sparsely would alias
         gray_j = np.asarray(cv2.GaussianBlur(gray_j, (0, 0), 0.5 * np.sqrt(shrink**2 - 1)))
     warped_j = np.asarray(sample(gray_j, grid + start), np.uint8)
-    residual = _residual(gray_i, warped_j, method, preset, finest_scale)
+    residual = _residual(gray_i, warped_j, method, preset, finest_scale, smoothness)
     flow = residual + sample(start, grid + residual)
     return np.asarray(flow, np.float32), residual
 
 
 def _residual(
-    gray_i: Gray, warped_j: Gray, method: Method, preset: Preset, finest_scale: int
-) -> Array:
+    gray_i: Gray, warped_j: Gray, method: Method, preset: Preset, finest_scale: int,
+    smoothness: float,
+) -> Array:  # fmt: skip
     """Flow between two images of the same size, padded where they are too small for a pyramid."""
     height, width = gray_i.shape
     down, right = max(0, _SMALLEST_SIDE - height), max(0, _SMALLEST_SIDE - width)
@@ -127,7 +127,7 @@ def _residual(
     if method == "dis":
         dis = cv2.DISOpticalFlow.create(_DIS_PRESETS[preset])
         dis.setFinestScale(finest_scale)
-        dis.setVariationalRefinementAlpha(_DIS_SMOOTHNESS)
+        dis.setVariationalRefinementAlpha(smoothness)
         flow = dis.calc(images[0], images[1], empty)
     else:
         flow = cv2.calcOpticalFlowFarneback(

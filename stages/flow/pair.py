@@ -43,6 +43,7 @@ class Estimator:
     method: estimate.Method = "dis"
     preset: estimate.Preset = "medium"
     finest_scale: int = 0
+    smoothness: float = 40.0
     normalization: float = 4.0
     prewarp: bool = True
     smoothing: float = 2.0
@@ -104,6 +105,7 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
             estimator.method,
             estimator.preset,
             estimator.finest_scale,
+            estimator.smoothness,
         )
         flows.append(flow)
         residuals.append(residual)

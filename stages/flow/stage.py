@@ -29,6 +29,10 @@ class FlowConfig(StageConfig):
     dis_finest_scale: int = Field(
         0, ge=0, le=5, description="Pyramid level at which DIS stops; 0 is full resolution."
     )
+    dis_smoothness: float = Field(
+        40.0, ge=0, le=1000,
+        description="Weight of the smoothness in DIS's variational refinement (OpenCV: 20).",
+    )  # fmt: skip
     contrast_window: float = Field(
         4.0,
         ge=0,
@@ -139,6 +143,7 @@ def _run(context: StageContext) -> None:
         method=config.method,
         preset=config.dis_preset,
         finest_scale=config.dis_finest_scale,
+        smoothness=config.dis_smoothness,
         normalization=config.contrast_window,
         prewarp=prewarp,
         smoothing=config.prewarp_smoothing,
