@@ -6,7 +6,8 @@ Every message is one clear paragraph: what is wrong, where, and what to do about
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 class PipelineError(Exception):
@@ -22,9 +23,18 @@ class RequestError(PipelineError):
 
 
 class ReconstructionError(PipelineError):
-    """The data can't be reconstructed. The message is the diagnosis: which views, what to do."""
+    """The data can't be reconstructed. The message is the diagnosis: which views, what to do.
+
+    Attributes:
+        pictures: name -> [H, W, 3] uint8 image that shows what is wrong. The runner keeps them in
+            the workspace and tells the user where.
+    """
 
     exit_status = 3
+
+    def __init__(self, message: str, pictures: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.pictures = dict(pictures or {})
 
 
 class StageError(PipelineError):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, load_config
-from pipeline.errors import PipelineError, RequestError, StageError
+from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
 from pipeline.measure import Measurement
 from pipeline.planning import (
     Input,
@@ -93,7 +93,8 @@ class RunContext(StageContext):
 
     def output(self, kind: str) -> Path:
         stage = get_stage(self._planned.name)
-        assert kind in stage.provides, f"{stage.name} does not declare that it provides {kind}"
+        declared = (*stage.provides, *stage.may_provide)
+        assert kind in declared, f"{stage.name} does not declare that it provides {kind}"
         path = self._folder / kind
         path.mkdir(exist_ok=True)
         if kind not in self.outputs:
@@ -165,7 +166,11 @@ class Runner:
         for name in self.chain.names:
             stage = plan_stage(name, self.config, self.store, table, self.request.images)
             planned.append(stage)
-            for kind in get_stage(name).provides:
+            if stage.result is not None:
+                made = tuple(stage.result.contents)
+            else:
+                made = (*get_stage(name).provides, *get_stage(name).may_provide)
+            for kind in made:
                 table[kind] = Input(name, kind, stage.result)
         return planned
 
@@ -301,7 +306,7 @@ class Runner:
                 "warnings": context.warnings,
                 **measurement.figures,
             }
-            return self.store.commit(name, key, manifest, list(stage.provides))
+            return self.store.commit(name, key, manifest, context.outputs)
         except (KeyboardInterrupt, CorruptResultError):
             raise
         except Exception as error:
@@ -332,6 +337,9 @@ class Runner:
                 "is kept. Run again with --debug for the whole trace, and please report it."
             )
         self.store.discard_outputs(name, key)
+        if isinstance(failure, ReconstructionError) and failure.pictures:
+            folder = self.store.keep_pictures(name, failure.pictures)
+            failure.args = (f"{failure} Pictures that show it: {folder}",)
         self.store.record_failure(name, key, str(failure))
         return failure
 

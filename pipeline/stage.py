@@ -92,9 +92,10 @@ class Stage(ABC):
         requires: artifact kinds it can't do without.
         optional: kinds it uses where an earlier stage provides them.
         provides: kinds it writes.
+        may_provide: kinds that it writes only for some input.
         libraries: distributions whose versions can change the result, so that they enter the key.
         methods: value of the config field `method` -> one line about it, where there is a choice.
-        uses_sources: True for a stage that reads the user's files (they are part of its key).
+        uses_sources: True for a stage that reads the photographs (they are part of its key).
     """
 
     name: ClassVar[str]
@@ -104,12 +105,13 @@ class Stage(ABC):
     requires: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
     provides: ClassVar[tuple[str, ...]] = ()
+    may_provide: ClassVar[tuple[str, ...]] = ()
     libraries: ClassVar[tuple[str, ...]] = ()
     methods: ClassVar[Mapping[str, str]] = {}
     uses_sources: ClassVar[bool] = False
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        """Name the files that the stage will read, for stages with `uses_sources`.
+        """Name the user's files that the stage will read: their content enters its key.
 
         Args:
             config: the stage's validated config.

@@ -7,6 +7,7 @@ Layout of a workspace::
     WORKSPACE/<stage>/<key12>.partial/    being written; `scratch/` inside survives a kill
     WORKSPACE/<stage>/current.json        which result is in use
     WORKSPACE/<stage>/failure.json        why the last try failed, until one succeeds
+    WORKSPACE/<stage>/failure/            pictures that show it, where there are any
     WORKSPACE/request.json                what was asked for last
     WORKSPACE/results                     link to the exports in use
 """
@@ -20,7 +21,7 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,6 +140,7 @@ class Store:
         if self.pointer(result.stage) != pointer:
             write_json(self.root / result.stage / "current.json", pointer)
         (self.root / result.stage / "failure.json").unlink(missing_ok=True)
+        shutil.rmtree(self.root / result.stage / "failure", ignore_errors=True)
 
     def quarantine(self, stage: str, folder: Path) -> Path:
         """Move a damaged result aside. It is kept for inspection until the next `clean`."""
@@ -228,6 +230,16 @@ class Store:
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
+
+    def keep_pictures(self, stage: str, images: Mapping[str, Any]) -> Path:
+        """Keep what a failed stage drew of the trouble, instead of what an earlier one drew."""
+        from pipeline.artifacts.pictures import Pictures
+
+        folder = self.root / stage / "failure"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        Pictures(images).save(folder)
+        return folder
 
     def failure(self, stage: str) -> dict[str, Any] | None:
         """What `record_failure` last wrote, if no run has succeeded since."""

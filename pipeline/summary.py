@@ -110,6 +110,8 @@ def print_stages(stages: list[dict[str, Any]]) -> None:
             table.add_row(stage["name"], f"[red]{stage['error']}[/]")
             continue
         kinds = [", ".join(stage[key]) for key in ("requires", "optional", "provides")]
+        if stage["may_provide"]:
+            kinds[-1] += f"; sometimes {', '.join(stage['may_provide'])}"
         table.add_row(stage["name"], stage["summary"], *kinds)
         for method, text in stage["methods"].items():
             table.add_row("", f"  method {method}: {text}")

@@ -106,6 +106,7 @@ def stages() -> list[dict[str, Any]]:
                 "requires": list(stage.requires),
                 "optional": list(stage.optional),
                 "provides": list(stage.provides),
+                "may_provide": list(stage.may_provide),
                 "methods": dict(stage.methods),
                 "settings": stage.Config.model_json_schema(),
             }

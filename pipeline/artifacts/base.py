@@ -19,6 +19,7 @@ KINDS: dict[str, str] = {
     "gaussians": "pipeline.artifacts.gaussians:Gaussians",
     "exports": "pipeline.artifacts.exports:Exports",
     "metrics": "pipeline.artifacts.metrics:Metrics",
+    "pictures": "pipeline.artifacts.pictures:Pictures",
 }
 
 

@@ -98,8 +98,8 @@ def reconstruct(
     """
     side = max(max(gray.shape) for gray in grays)
     pixel = side / REFERENCE_SIDE
-    features = _features(grays, valid, options, threads, progress)
-    correspondences = _correspondences(features, ordered, options, pixel, threads, progress)
+    features = find_features(grays, valid, options, threads, progress)
+    correspondences = match_views(features, ordered, options, pixel, threads, progress)
     lenses, lens_of_view = group_lenses([gray.shape for gray in grays], focals)
     given = MappingInput(
         lenses=lenses,
@@ -167,7 +167,7 @@ def group_lenses(
     return lenses, lens_of_view
 
 
-def _features(
+def find_features(
     grays: list[npt.NDArray[np.uint8]],
     valid: list[npt.NDArray[np.bool_]],
     options: ClassicalOptions,
@@ -187,7 +187,7 @@ def _features(
     )
 
 
-def _correspondences(
+def match_views(
     features: list[Features],
     ordered: bool,
     options: ClassicalOptions,

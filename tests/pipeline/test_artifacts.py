@@ -12,6 +12,7 @@ from pipeline.artifacts.cameras import Camera, Cameras, read_colmap
 from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.gaussians import Gaussians, ply_properties
 from pipeline.artifacts.metrics import Metrics
+from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
@@ -66,6 +67,7 @@ def samples() -> dict[str, Artifact]:
             floats(9, 3), floats(9, 4), floats(9, 3), floats(9), floats(9, 16, 3)
         ),
         "metrics": Metrics({"mean": {"psnr": 31.25}, "unplaced": []}),
+        "pictures": Pictures({"matches": rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)}),
     }
 
 

@@ -71,7 +71,7 @@ def test_real_quantile_out_of_range_is_refused() -> None:
 
 def test_runtime_fields_stay_out_of_the_result(toys: Path) -> None:
     section = load_config(toys / "toy.yaml").sections["scale"]
-    assert result_fields(section) == {"factor": 2.0, "round": False}
+    assert result_fields(section) == {"factor": 2.0, "note": False, "round": False}
 
 
 @given(st.one_of(st.integers(), st.floats(allow_nan=False), st.booleans(), st.text(), st.none()))

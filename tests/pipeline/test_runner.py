@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 import pipeline
+from pipeline.artifacts.views import read_png
 from pipeline.store import Store
 
 ALL_RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
@@ -139,6 +141,28 @@ def test_failure_keeps_what_was_computed(
     assert failed.failure
     assert run() == {"read": "cached", "scale": "cached", "count": "ran", "publish": "ran"}
     assert all(s.failure is None for s in pipeline.status(workspace=toys / "w"))
+
+
+def test_pictures_of_a_failure_are_kept_until_a_run_succeeds(run: Any, toys: Path) -> None:
+    folder = toys / "w" / "count" / "failure"
+    with pytest.raises(pipeline.ReconstructionError, match=re.escape(str(folder))):
+        run("count.fail=data")
+    picture = read_png(folder / "pair.png")
+    assert picture.shape == (4, 6, 3) and (picture == 77).all()
+    run()
+    assert not folder.exists()
+
+
+def test_a_stage_may_provide_a_kind_for_some_input_only(run: Any, toys: Path) -> None:
+    run()
+    without = pipeline.status(workspace=toys / "w")
+    assert {s.state for s in without} == {"cached"}
+    states = run("scale.note=true")  # the same numbers come out in the end
+    assert states == {"read": "cached", "scale": "ran", "count": "ran", "publish": "cached"}
+    assert {s.state for s in pipeline.status(workspace=toys / "w")} == {"cached"}
+    folder = next(s for s in pipeline.status(workspace=toys / "w") if s.name == "scale").folder
+    assert folder and (Path(folder) / "metrics" / "metrics.json").exists()
+    assert run()["count"] == "cached"
 
 
 def test_interrupted_stage_resumes_to_the_same_bytes(run: Any, toys: Path) -> None:

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
 from pydantic import Field
 
 import pipeline.stage
@@ -58,15 +59,19 @@ class ScaleStage(Stage):
     name, version, summary = "scale", 1, "multiplies"
     requires = ("numbers",)
     provides = ("numbers",)
+    may_provide = ("metrics",)
     libraries = ("numpy",)
 
     class Config(StageConfig):
         factor: float = Field(2.0, gt=0, lt=10, description="what to multiply with")
         round: bool = False
+        note: bool = False
         log_every: int = runtime(1)
 
     def run(self, context: StageContext) -> None:
         factor = round(context.config.factor) if context.config.round else context.config.factor
+        if context.config.note:
+            (context.output("metrics") / "metrics.json").write_text('{"note": 1}')
         context.save(Numbers([value * factor for value in context.load("numbers").values]))
 
 
@@ -109,7 +114,10 @@ class CountStage(Stage):
 
     def _maybe_fail(self, how: str) -> None:
         if how == "data":
-            raise ReconstructionError("Photos 'a' and 'b' share too little; add one between them.")
+            raise ReconstructionError(
+                "Photos 'a' and 'b' share too little; add one between them.",
+                {"pair": np.full((4, 6, 3), 77, np.uint8)},
+            )
         if how == "bug":
             raise ZeroDivisionError("oops")
         if how == "disk":

@@ -1,0 +1,34 @@
+"""`pictures`: what a stage draws for people to check at a glance, such as labelled photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.base import Artifact
+from pipeline.artifacts.views import read_png, write_png
+
+
+@dataclass(frozen=True)
+class Pictures(Artifact):
+    """Pictures of one stage's work.
+
+    Attributes:
+        images: name (a file name without suffix) -> [H, W, 3] uint8 sRGB.
+    """
+
+    kind: ClassVar[str] = "pictures"
+    images: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+
+    def save(self, folder: Path) -> None:
+        for name, image in sorted(self.images.items()):
+            write_png(folder / f"{name}.png", image)
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        return cls({path.stem: read_png(path) for path in sorted(folder.glob("*.png"))})

@@ -1,0 +1,190 @@
+"""The ways of finding cameras, each from views to a `Placement`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View
+from pipeline.errors import ReconstructionError
+from stages.init.classical import Attempt, find_features, match_views, reconstruct
+from stages.init.diagnosis import HOW_TO_SHOOT, Limits, failure
+from stages.init.geometry import Correspondences, Pair
+from stages.init.known import KnownCamera, as_pinhole
+from stages.init.options import REFERENCE_SIDE, ClassicalOptions
+from stages.init.placement import Placement
+from stages.init.triangulate import agreeing_matches, link_tracks, triangulate
+
+Progress = Callable[[str, int, int], None]
+Warn = Callable[[str], None]
+
+#: With fewer points than this in a view, its depth range can't be told.
+LEAST_POINTS = 8
+#: Of the coherent matches of a pair, nearly all lie on the epipolar lines of the right cameras, and
+#: one in ten on those of wrong ones; below this share the cameras are wrong.
+LEAST_AGREEMENT = 0.4
+#: Pairs with fewer coherent matches say nothing about the cameras.
+TELLING_MATCHES = 25
+
+
+def photo_name(view: View) -> str:
+    """How the user knows a photograph."""
+    return view.source_name or view.name
+
+
+def place_classical(
+    views: list[View], focals: list[float | None], focal_given: bool, ordered: bool,
+    least_views: int, options: ClassicalOptions, *, seed: int, threads: int, scratch: Path,
+    progress: Progress, warn: Warn,
+) -> Placement:  # fmt: skip
+    """Cameras from features and COLMAP's mappers (`stages.init.classical`).
+
+    Args:
+        focals: of each view in pixels, or None.
+        focal_given: the user said them; they are not refined.
+        ordered: the views are a sequence.
+        least_views: with fewer placed it is a failure.
+
+    Raises:
+        ReconstructionError: the photographs don't allow it; the message is the diagnosis.
+    """
+    pixel = max(max(view.width, view.height) for view in views) / REFERENCE_SIDE
+    attempt = reconstruct(
+        [view.gray() for view in views], [view.valid() for view in views], focals, focal_given,
+        ordered, options, seed=seed, threads=threads, scratch=scratch, progress=progress,
+    )  # fmt: skip
+    names = [photo_name(view) for view in views]
+    limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)
+    diagnosis = failure(attempt, names, limits)
+    if diagnosis:
+        raise ReconstructionError(diagnosis)
+    assert attempt.solution is not None
+    unplaced = [name for view, name in enumerate(names) if view not in attempt.solution.poses]
+    if unplaced:
+        warn(
+            f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
+            f"{', '.join(unplaced)}."
+        )
+    if not attempt.focal_determined:
+        warn(
+            "The photographs don't determine the focal length; the proportions of the scene may be "
+            "off. Keep the EXIF data or pass --set init.focal=..."
+        )
+    return _from_attempt(views, attempt)
+
+
+def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
+    solution = attempt.solution
+    assert solution is not None
+    order = sorted(solution.poses)
+    number = {view: position for position, view in enumerate(order)}
+    placed = [views[view] for view in order]
+    cameras = [
+        Camera(
+            name=view.name, width=view.width, height=view.height,
+            fx=solution.focals[index], fy=solution.focals[index],
+            cx=view.width / 2, cy=view.height / 2, cam_from_world=solution.poses[index],
+        )
+        for index, view in zip(order, placed, strict=True)
+    ]  # fmt: skip
+    weights = {
+        (number[i], number[j]): edge.evidence
+        for (i, j), edge in attempt.evidence.edges.items()
+        if (i, j) in solution.edges and i in number and j in number
+    }
+    return Placement(
+        views=tuple(placed), cameras=tuple(cameras), points=solution.points,
+        seen=tuple(solution.points_of(index) for index in order), weights=weights,
+        figures={
+            "reprojection_error_px": round(solution.error, 3),
+            "matches": sum(len(edge.inliers) for edge in attempt.evidence.edges.values()),
+        },
+    )  # fmt: skip
+
+
+def place_known(
+    views: list[View], known: dict[str, KnownCamera], units: str, ordered: bool,
+    options: ClassicalOptions, *, threads: int, progress: Progress, warn: Warn,
+) -> Placement:  # fmt: skip
+    """The cameras that the user gave; only the points are found.
+
+    Views without a camera are left out, with a warning. Distortion is taken out of the images.
+
+    Args:
+        known: name of a view -> its camera.
+        units: of the world of these cameras.
+
+    Raises:
+        ReconstructionError: too few matches agree with the cameras to tell where the scene is.
+    """
+    without = [photo_name(view) for view in views if view.name not in known]
+    if without:
+        warn(f"The model has no camera of {', '.join(without)}; left out.")
+    pairs = [as_pinhole(view, known[view.name]) for view in views if view.name in known]
+    placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
+    features = find_features(
+        [view.gray() for view in placed], [view.valid() for view in placed], options, threads,
+        progress,
+    )  # fmt: skip
+    pixel = max(max(view.width, view.height) for view in placed) / REFERENCE_SIDE
+    matches = match_views(features, ordered, options, pixel, threads, progress)
+    max_error = options.max_reprojection_error * pixel
+    chosen = agreeing_matches(cameras, matches, max_error)
+    tracks = link_tracks(
+        [feature.positions for feature in features], [feature.points for feature in features],
+        matches, chosen,
+    )  # fmt: skip
+    points, tracks = triangulate(cameras, tracks, max_error, options.min_tri_angle)
+    seen = [np.unique(tracks.point[tracks.view == number]) for number in range(len(placed))]
+    wrong = _contradicted(matches, chosen)
+    few = sum(len(those) >= LEAST_POINTS for those in seen) < 2
+    if few or len(wrong) >= len(placed) - 1:
+        raise ReconstructionError(
+            "The cameras given do not fit the photographs: of "
+            f"{sum(int(those.coherent.sum()) for those in matches.values())} matches "
+            f"{sum(len(those) for those in chosen.values())} lie where the cameras say. Are they "
+            f"the cameras of these photographs, at this zoom? {HOW_TO_SHOOT}"
+        )
+    if wrong:
+        warn(
+            "The cameras given of these photographs contradict what the photographs show: "
+            f"{', '.join(photo_name(placed[number]) for number in wrong)}."
+        )
+    errors = [
+        np.linalg.norm(camera.project(points[tracks.point[mine]])[0] - tracks.pixel[mine], axis=1)
+        for number, camera in enumerate(cameras)
+        for mine in [tracks.view == number]
+    ]
+    return Placement(
+        views=tuple(placed), cameras=tuple(cameras), points=points, seen=tuple(seen),
+        weights={pair: float(len(those)) for pair, those in chosen.items() if len(those)},
+        units=units,
+        figures={
+            "reprojection_error_px": round(float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), 3),
+            "matches": sum(len(those) for those in chosen.values()),
+        },
+    )  # fmt: skip
+
+
+def _contradicted(
+    matches: dict[Pair, Correspondences], chosen: dict[Pair, npt.NDArray[np.int64]]
+) -> list[int]:
+    """Views of whose telling pairs none agrees with the cameras."""
+    best: dict[int, float] = {}
+    for pair, found in matches.items():
+        coherent = int(found.coherent.sum())
+        if coherent >= TELLING_MATCHES:
+            for view in pair:
+                best[view] = max(best.get(view, 0.0), len(chosen[pair]) / coherent)
+    return sorted(view for view, share in best.items() if share < LEAST_AGREEMENT)
+
+
+def with_focals(views: Iterable[View], ratio: float | None) -> list[float | None]:
+    """Focal length of each view in pixels: `ratio` times its long side, or what EXIF says."""
+    return [
+        ratio * max(view.width, view.height) if ratio else view.focal_px for view in views
+    ]  # fmt: skip

@@ -1,0 +1,64 @@
+"""What every way of finding the cameras leads to, and bringing it into a normalised world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View
+from stages.init.geometry import Pair
+from stages.init.normalise import moved_points, moved_pose, world_similarity
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The views that could be placed, their cameras, and sparse points that they observe.
+
+    Attributes:
+        views: the placed views, their images as pinhole cameras see them (undistorted).
+        cameras: one for each of them.
+        points: [P, 3] world.
+        seen: for each of them [K] int64 indices of the points that it observes.
+        weights: pairs of them by position -> how well their matches link them.
+        input_from_world: [4, 4] similarity to the frame of known input; identity: nothing known.
+        units: ``"mm"`` or ``"arbitrary"``, of that frame.
+        figures: for the summary.
+    """
+
+    views: tuple[View, ...]
+    cameras: tuple[Camera, ...]
+    points: Array
+    seen: tuple[npt.NDArray[np.int64], ...]
+    weights: dict[Pair, float]
+    input_from_world: Array = field(default_factory=lambda: np.eye(4))
+    units: str = "arbitrary"
+    figures: dict[str, float | int | str] = field(default_factory=dict)
+
+    def normalised(self) -> Placement:
+        """The same in a world that is centred, scaled and upright (`world_similarity`).
+
+        `input_from_world` still leads to the same frame.
+        """
+        scale, rotation, centre = world_similarity(
+            [camera.cam_from_world for camera in self.cameras], self.points
+        )
+        old_from_new = np.eye(4)
+        old_from_new[:3, :3] = rotation.T / scale
+        old_from_new[:3, 3] = centre
+        return replace(
+            self,
+            cameras=tuple(
+                replace(
+                    camera,
+                    cam_from_world=moved_pose(camera.cam_from_world, scale, rotation, centre),
+                )
+                for camera in self.cameras
+            ),
+            points=moved_points(self.points, scale, rotation, centre),
+            input_from_world=self.input_from_world @ old_from_new,
+        )

@@ -1,0 +1,290 @@
+"""Cameras and lengths that the user knows: read, matched to photographs, undistorted, used."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import ReconstructionError, RequestError
+from pipeline.stage import LocalContext
+from stages.init.geometry import Correspondences
+from stages.init.known import (
+    KnownCamera,
+    as_pinhole,
+    matching_cameras,
+    model_files,
+    read_cameras,
+)
+from stages.init.scale import mm_per_unit, working_pixel
+from stages.init.stage import InitConfig, InitStage
+from stages.init.triangulate import (
+    agreeing_matches,
+    epipolar_distance,
+    link_tracks,
+    triangulate,
+)
+
+SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
+TRUTH = json.loads((SAMPLES / "transforms.json").read_text())
+
+
+def look_at(yaw, distance=4.0):
+    angle = np.radians(yaw)
+    centre = distance * np.array([np.sin(angle), 0, -np.cos(angle)])
+    forward = -centre / distance
+    right = np.cross([0, 1, 0], forward)
+    rotation = np.stack([right, [0, 1, 0], forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return pose
+
+
+def sample_views():
+    views = []
+    for number, frame in enumerate(TRUTH["frames"]):
+        image = cv2.imread(str(SAMPLES / frame["file_path"]))[..., ::-1]
+        image = image.astype(np.float32) / np.float32(255)
+        name = Path(frame["file_path"]).name
+        size = image.shape[1::-1]
+        views.append(View(f"{number:03d}", image, source_name=name, source_size=size))
+    return Views(tuple(views))
+
+
+def run(tmp_path, sources, views=None, **config):
+    context = LocalContext(
+        InitConfig(**config), tmp_path, inputs={"views": views or sample_views()},
+        sources=sources, threads=2,
+    )  # fmt: skip
+    InitStage().run(context)
+    return context
+
+
+def colmap_model(folder, model="PINHOLE", extra=(), names=None):
+    """The sample's cameras as a COLMAP model."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = pycolmap.Reconstruction()
+    parameters = {
+        "PINHOLE": [TRUTH["fl_x"], TRUTH["fl_x"], 256, 192],
+        "SIMPLE_RADIAL": [TRUTH["fl_x"], 256, 192, *extra],
+    }[model]
+    for number, frame in enumerate(TRUTH["frames"], 1):
+        lens = pycolmap.Camera(
+            camera_id=number, model=model, width=512, height=384, params=parameters
+        )
+        written.add_camera_with_trivial_rig(lens)
+        name = names[number - 1] if names else Path(frame["file_path"]).name
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        pose = pycolmap.Rigid3d(np.array(frame["w2c_opencv"])[:3])
+        written.add_image_with_trivial_frame(image, pose)
+    written.write_text(str(folder))
+    return folder
+
+
+def test_known_cameras_are_kept_and_the_depth_is_true(tmp_path):
+    config = InitConfig(cameras=str(SAMPLES / "transforms.json"))
+    context = run(tmp_path, InitStage().sources(config, {}))
+    cameras = context.result("cameras")
+    assert cameras.units == "mm"
+    scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
+    for camera, frame in zip(cameras.cameras, TRUTH["frames"], strict=True):
+        truth = np.array(frame["w2c_opencv"])
+        world_from_cam = cameras.input_from_world @ np.linalg.inv(camera.cam_from_world)
+        np.testing.assert_allclose(
+            world_from_cam[:3, :3] / scale, np.linalg.inv(truth)[:3, :3], atol=1e-9
+        )
+        np.testing.assert_allclose(world_from_cam[:3, 3], np.linalg.inv(truth)[:3, 3], atol=1e-6)
+        assert (camera.fx, camera.cx, camera.cy) == (TRUTH["fl_x"], 256, 192)
+    errors = []
+    for pair in context.result("pointmaps"):
+        frame = next(f for f in TRUTH["frames"] if sample_name(f) == pair.name_i)
+        stored = cv2.imread(str(SAMPLES / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED) / 200
+        truth = cv2.resize(stored, (512, 384), interpolation=cv2.INTER_NEAREST)
+        sure = (pair.confidence_i > 5) & (truth > 0)
+        errors.append(np.abs(pair.points_i[..., 2] * scale - truth)[sure])
+    assert np.median(np.concatenate(errors)) < 0.25  # mm
+
+
+def sample_name(frame):
+    return f"{TRUTH['frames'].index(frame):03d}"
+
+
+def test_colmap_model_is_found_in_the_usual_folders_and_reads_like_transforms(tmp_path):
+    colmap_model(tmp_path / "scene" / "sparse" / "0")
+    found, units = read_cameras(model_files(tmp_path / "scene").values())
+    reference, _ = read_cameras(model_files(SAMPLES).values())
+    assert units == "arbitrary"
+    assert [c.name for c in found] == [c.name for c in reference]
+    for a, b in zip(found, reference, strict=True):
+        np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-6)
+
+
+def test_distortion_is_taken_out_of_the_image(tmp_path):
+    """A picture of straight lines, bent by the lens, is straight again."""
+    lens = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=512, height=384, params=[500, 256, 192, -0.2]
+    )
+    v, u = np.mgrid[:384, :512] + 0.5
+    rays = lens.cam_from_img(np.stack([u.ravel(), v.ravel()], 1))
+    # Each pixel shows a chequered plane in front of the camera.
+    plane = np.asarray(rays)[:, :2].reshape(384, 512, 2)
+    sharp = 0.5 + 0.5 * np.tanh(20 * np.sin(40 * plane[..., 0]) * np.sin(40 * plane[..., 1]))
+    view = View("000", np.repeat(sharp[..., None], 3, 2).astype(np.float32), source_size=(512, 384))
+    flat, camera = as_pinhole(view, KnownCamera("a.jpg", lens, np.eye(4)))
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    expected = 0.5 + 0.5 * np.tanh(20 * np.sin(40 * x) * np.sin(40 * y))
+    inside = flat.valid()
+    assert inside.mean() > 0.9
+    assert np.abs(flat.image[..., 0] - expected)[inside].mean() < 0.03
+    assert np.abs(view.image[..., 0] - expected)[inside].mean() > 0.1  # it was bent before
+
+
+def test_distorted_model_gives_undistorted_views(tmp_path):
+    folder = colmap_model(tmp_path / "model", "SIMPLE_RADIAL", (-0.05,))
+    context = run(tmp_path / "out", model_files(folder))
+    views = context.result("views")
+    assert len(views) == 3 and context.figures["undistorted"] == 3
+    assert any(
+        np.abs(new.image - old.image).max() > 0.05
+        for new, old in zip(views.views, sample_views().views, strict=True)
+    )
+
+
+@pytest.mark.parametrize("lens_size", [(384, 512), (512, 384)])
+def test_lens_of_a_photograph_stored_on_its_side(lens_size):
+    """The same ray meets the same pixel, whether the model was made of the stored or upright one.
+
+    Stored 512 x 384, shown turned by 90 degrees clockwise.
+    """
+    working_from_stored = np.array([[0.0, -1, 384], [1, 0, 0], [0, 0, 1]])
+    view = View(
+        "000", np.zeros((512, 384, 3), np.float32),
+        working_from_source=working_from_stored, source_size=(512, 384),
+    )  # fmt: skip
+    width, height = lens_size
+    lens = pycolmap.Camera(
+        model="PINHOLE", width=width, height=height, params=[500, 520, width / 2 + 7, height / 2]
+    )
+    _, camera = as_pinhole(view, KnownCamera("a.jpg", lens, look_at(20)))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
+    pixels, _ = camera.project(points)
+    local = points @ look_at(20)[:3, :3].T + look_at(20)[:3, 3]
+    expected = np.asarray(lens.img_from_cam(local))
+    if lens_size == (512, 384):
+        expected = expected @ working_from_stored[:2, :2].T + working_from_stored[:2, 2]
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)
+
+
+def test_wrong_cameras_are_refused_in_words(tmp_path):
+    with pytest.raises(RequestError, match=r"holds no cameras"):
+        model_files(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": [{"file_path": "a.png"')
+    with pytest.raises(RequestError, match="can't be read"):
+        read_cameras(model_files(tmp_path).values())
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]})
+    )
+    with pytest.raises(RequestError, match=r"gives no 'w' for a\.png"):
+        read_cameras(model_files(tmp_path).values())
+    cameras, _ = read_cameras(model_files(SAMPLES).values())
+    strangers = [View("a", np.zeros((3, 4, 3), np.float32), source_name="x.jpg")]
+    with pytest.raises(RequestError, match=r"fewer than two .* like frontal\.jpg.* like x\.jpg"):
+        matching_cameras(cameras, strangers)
+    view = View("a", np.zeros((300, 300, 3), np.float32), source_size=(300, 300))
+    with pytest.raises(RequestError, match="512 x 384"):
+        as_pinhole(view, cameras[0])
+    with pytest.raises(RequestError, match="no cameras are given"):
+        InitStage().sources(InitConfig(method="known"), {})
+
+
+def test_cameras_of_other_photographs_are_noticed(tmp_path):
+    """The names fit, but the poses are another scene's."""
+    folder = colmap_model(tmp_path / "model")
+    cameras, _ = read_cameras(model_files(folder).values())
+    shuffled = pycolmap.Reconstruction(str(folder))
+    for number, camera in enumerate(cameras):
+        turned = pycolmap.Rigid3d(look_at(120 * number + 50, 60)[:3])
+        shuffled.images[number + 1].frame.rig_from_world = turned
+        assert camera.name
+    shuffled.write_text(str(folder))
+    with pytest.raises(ReconstructionError, match="do not fit the photographs"):
+        run(tmp_path / "out", model_files(folder))
+
+
+def test_photographs_without_camera_are_named(tmp_path):
+    folder = colmap_model(tmp_path / "m", names=["frontal.jpg", "left_buccal.jpg", "other.jpg"])
+    names = [Path(frame["file_path"]).name for frame in TRUTH["frames"]]
+    assert names == ["right_buccal.jpg", "frontal.jpg", "left_buccal.jpg"]
+    found = matching_cameras(read_cameras(model_files(folder).values())[0], sample_views().views)
+    assert sorted(found) == ["001", "002"]
+
+
+def test_tracks_are_triangulated_and_wrong_matches_dropped():
+    rng = np.random.default_rng(1)
+    cameras = [Camera(str(k), 400, 400, 500, 500, 200, 200, look_at(15 * k)) for k in range(3)]
+    truth = rng.uniform(-0.6, 0.6, (60, 3))
+    pixels = [camera.project(truth)[0] for camera in cameras]
+    matches = {}
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        features = np.stack([np.arange(60), np.arange(60)], 1)
+        features[:10, 1] = rng.permutation(10) + 20  # ten wrong matches
+        matches[i, j] = Correspondences(
+            features, pixels[i][features[:, 0]], pixels[j][features[:, 1]], np.ones(60, bool)
+        )
+    distance = epipolar_distance(cameras[0], cameras[1], matches[0, 1])
+    assert distance[10:].max() < 1e-6 and np.median(distance[:10]) > 3
+    chosen = agreeing_matches(cameras, matches, 1.0)
+    tracks = link_tracks(pixels, [np.arange(60)] * 3, matches, chosen)
+    points, kept = triangulate(cameras, tracks, 1.0, 1.0)
+    assert len(points) >= 50
+    nearest = np.linalg.norm(points[:, None] - truth[None], axis=-1).min(1)
+    assert np.mean(nearest < 1e-6) > 0.9
+    for number, camera in enumerate(cameras):
+        mine = kept.view == number
+        assert np.abs(camera.project(points[kept.point[mine]])[0] - kept.pixel[mine]).max() < 1
+
+
+def test_known_length_gives_millimetres(tmp_path):
+    """Two corners of a tooth, measured in a photograph; the truth is in millimetres."""
+    frame = TRUTH["frames"][1]
+    stored = cv2.imread(str(SAMPLES / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED) / 200
+    start, end = np.array([236.0, 172.0]), np.array([282.0, 174.0])
+    places = []
+    for pixel in (start, end):
+        z = stored[int(pixel[1] / 2), int(pixel[0] / 2)]
+        assert z > 0
+        places.append(np.array([*(pixel - (256, 192)) / TRUTH["fl_x"], 1]) * z)
+    mm = float(np.linalg.norm(places[0] - places[1]))
+    folder = colmap_model(tmp_path / "model")
+    length = {"mm": mm, "photo": "frontal", "start": tuple(start), "end": tuple(end)}
+    context = run(tmp_path / "out", model_files(folder), length=length)
+    cameras = context.result("cameras")
+    assert cameras.units == "mm"
+    scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
+    truth = np.linalg.norm(
+        np.linalg.inv(TRUTH["frames"][0]["w2c_opencv"])[:3, 3]
+        - np.linalg.inv(TRUTH["frames"][2]["w2c_opencv"])[:3, 3]
+    )
+    ours = scale * np.linalg.norm(cameras.cameras[0].centre - cameras.cameras[2].centre)
+    assert abs(ours / truth - 1) < 0.02
+    with pytest.raises(RequestError, match=r"no photograph 'frontel'.*frontal"):
+        run(tmp_path / "wrong", model_files(folder), length={**length, "photo": "frontel"})
+
+
+def test_length_that_cannot_be_measured_is_refused():
+    view = View("a", np.zeros((30, 40, 3), np.float32), source_size=(400, 300))
+    camera = Camera("a", 40, 30, 50, 50, 20, 15, np.eye(4))
+    depth = np.full((30, 40), 2, np.float32)
+    np.testing.assert_allclose(working_pixel(view, (100, 50)), (10, 5))
+    # 20 working pixels at depth 2 and focal length 50 are 0.8 units.
+    assert mm_per_unit(view, camera, depth, (100, 100), (300, 100), 8.0) == pytest.approx(10)
+    with pytest.raises(RequestError, match="outside the photograph"):
+        mm_per_unit(view, camera, depth, (100, 100), (500, 100), 8.0)
+    with pytest.raises(RequestError, match="nothing is known of the depth"):
+        mm_per_unit(view, camera, 0 * depth, (100, 100), (300, 100), 8.0)
+    with pytest.raises(RequestError, match="the same place"):
+        mm_per_unit(view, camera, depth, (100, 100), (100, 100), 8.0)
