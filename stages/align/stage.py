@@ -13,25 +13,78 @@ from pipeline.stage import Stage, StageConfig, StageContext
 class AlignConfig(StageConfig):
     """Settings of the stage `align`."""
 
-    refine_poses: Literal["auto", "on", "off"] = Field(
+    refine: Literal["auto", "always", "never"] = Field(
         "auto",
-        description="Optimise the cameras against the pointmaps: auto does so only where there are "
-        "none yet; on: also cameras that an earlier stage gave; off: keep the start.",
+        description="Optimise the cameras against the pointmaps: auto does so where there are none "
+        "yet, or only provisional ones; always: also known cameras and those that an earlier "
+        "stage has optimised; never: keep the start.",
+    )
+    hold_poses: bool = Field(
+        False, description="Poses stay as given; focal lengths and scales are optimised."
+    )
+    hold_focals: Literal["auto", "always", "never"] = Field(
+        "auto", description="Focal lengths stay; auto: where the photographs' EXIF data say them."
+    )
+    shared_focal: Literal["auto", "always", "never"] = Field(
+        "auto", description="One focal length for all photographs; auto: for the frames of a video."
     )
     iterations: int = Field(
-        300, ge=0, le=100_000, description="Steps of the global alignment (Adam)."
+        30, ge=0, le=10_000, description="Steps of the global alignment at most."
     )
-    learning_rate: float = Field(
-        0.01, gt=0, le=1, description="At the start; falls to 1e-6 along a cosine."
-    )
-    refine_learning_rate: float = Field(
-        0.001, gt=0, le=1, description="The same, where given cameras are refined."
+    tolerance: float = Field(
+        1e-5,
+        ge=0,
+        lt=1,
+        description="A step that lowers the objective by a smaller share is the last.",
     )
     samples: int = Field(
         3000, ge=100, le=10_000_000, description="Pixels per view in the global alignment."
     )
-    free_focals: bool = Field(
-        True, description="Optimise focal lengths too (only where there were no cameras)."
+    huber: float = Field(
+        1.0,
+        ge=0,
+        le=100,
+        description="Residual from which the loss is linear, in median residuals; 0: everywhere.",
+    )
+    free_pairs: bool = Field(
+        False,
+        description="A pair's frame may differ from the camera of its first view, as in DUSt3R; "
+        "for models whose maps don't fit a pinhole camera. Less accurate.",
+    )
+    matches: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="Refine the cameras by bundle adjustment of image features that the pointmaps "
+        "help to match; auto: where the cameras come from pointmaps alone.",
+    )
+    match_features: int = Field(
+        3000, ge=100, le=100_000, description="Features per view for that, at most."
+    )
+    match_points: int = Field(3000, ge=10, description="Matched points that are used, at most.")
+    match_search_px: float = Field(
+        20.0,
+        gt=0,
+        le=1000,
+        description="How far from where the pointmaps say a match may lie, px at 512 px width.",
+    )
+    match_ratio: float = Field(
+        0.85, gt=0, le=1, description="Ratio test: best over next match in that area."
+    )
+    match_max_angle: float = Field(
+        45.0, gt=0, le=180, description="Views turned further apart are not matched, degrees."
+    )
+    match_max_error: float = Field(
+        3.0, gt=0, le=100, description="Beyond it a match is dropped, px at 512 px width."
+    )
+    match_min: int = Field(
+        80, ge=8, description="With fewer matches in any view, the cameras stay as they are."
+    )
+    match_min_gain: float = Field(
+        2.0,
+        ge=1,
+        description="The cameras stay as they are unless the matches' error falls by this factor.",
+    )
+    match_focals_from: int = Field(
+        6, ge=2, description="From so many views on, the matches also correct focal lengths."
     )
     fill_confidence: float = Field(
         1.25, ge=1,
@@ -61,23 +114,23 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 1
+    version = 2
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")
     optional = ("cameras",)
     provides = ("cameras", "points")
-    libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "torch", "kornia")
+    libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
 
     def run(self, context: StageContext) -> None:
         import numpy as np
 
         from pipeline.artifacts.cameras import Cameras
         from pipeline.artifacts.points import Points
-        from stages.align.depths import view_depths
         from stages.align.fusion import FusionOptions, fuse
-        from stages.align.start import start_from_cameras, start_from_tree
-        from stages.align.world import move_camera, normalising_similarity
+        from stages.geometry.depths import view_depths
+        from stages.geometry.start import start_from_cameras, start_from_tree
+        from stages.geometry.world import move_camera, normalising_similarity
 
         config: AlignConfig = context.config
         views = context.load("views")
@@ -94,31 +147,22 @@ class AlignStage(Stage):
             )
         pairs = [_checked(pair, by_name) for pair in pairs]
         given = context.load("cameras") if context.has("cameras") else None
-        context.progress("start", 0, 1, pairs=len(pairs))
-        if given is None or len(given) == 0:
+        if given is not None and len(given) == 0:
             given = None
-            start = start_from_tree(pairs)
-            refine = config.refine_poses != "off"
-        else:
-            start = start_from_cameras(pairs, given.by_name())
-            refine = config.refine_poses == "on"
+        context.progress("start", 0, 1, pairs=len(pairs))
+        start = (
+            start_from_tree(pairs) if given is None else start_from_cameras(pairs, given.by_name())
+        )
         figures: dict[str, float | int] = {}
-        if refine and config.iterations and start.cameras:
-            from stages.align.optimise import AlignOptions, optimise
-
-            options = AlignOptions(
-                iterations=config.iterations,
-                learning_rate=config.learning_rate
-                if given is None
-                else config.refine_learning_rate,
-                samples=config.samples,
-                free_focals=config.free_focals and given is None,
-            )
-            start, residual = optimise(
-                pairs, start, options,
-                lambda done, total, loss: context.progress("align", done, total, residual=loss),
-            )  # fmt: skip
-            figures["alignment_residual"] = round(residual, 5)
+        provisional = given is None or given.provisional
+        if start.cameras and (
+            config.refine == "always" or (config.refine == "auto" and provisional)
+        ):
+            start, figures["alignment_residual"] = _optimised(context, views, pairs, start)
+            if config.matches == "always" or (config.matches == "auto" and provisional):
+                start = _matched(context, views, pairs, start, figures)
+            if given is not None:
+                start = _back_in_world(start, given)
         merged = view_depths(pairs, start)
         if len(merged) < 2:
             raise ReconstructionError(
@@ -174,6 +218,104 @@ class AlignStage(Stage):
             points=len(cloud), fill_points=cloud.fill, views=len(placed),
             views_total=len(views), **figures,
         )  # fmt: skip
+
+
+def _optimised(context, views, pairs, start):  # type: ignore[no-untyped-def]
+    """The start, improved, and the mean residual."""
+    from stages.align.optimise import AlignOptions, optimise
+
+    config: AlignConfig = context.config
+    hold_focals, shared = _focal_rules(config, views, start)
+    options = AlignOptions(
+        iterations=config.iterations,
+        samples=config.samples,
+        tolerance=config.tolerance,
+        huber=config.huber,
+        free_focals=not hold_focals,
+        free_poses=not config.hold_poses,
+        shared_focal=shared,
+        free_pairs=config.free_pairs,
+    )
+    better, residual = optimise(
+        pairs, start, options,
+        lambda done, total, loss: context.progress("align", done, total, residual=loss),
+    )  # fmt: skip
+    return better, round(residual, 5)
+
+
+def _focal_rules(config, views, start):  # type: ignore[no-untyped-def]
+    """Whether focal lengths are held, and whether there is one for all."""
+    # Cameras whose focal length is what the photograph's own data say.
+    stated = [
+        view.name in start.cameras
+        and view.focal_px is not None
+        and abs(start.cameras[view.name].fx / view.focal_px - 1) < 1e-6
+        for view in views.views
+    ]
+    hold = all(stated) if config.hold_focals == "auto" else config.hold_focals == "always"
+    shared = views.ordered if config.shared_focal == "auto" else config.shared_focal == "always"
+    return hold, shared
+
+
+def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-def]
+    """The start with cameras that sparse matches have refined, where there are enough of them."""
+    from stages.align.bundle import BundleOptions, refine_with_matches
+    from stages.align.optimise import AlignOptions, optimise
+    from stages.geometry.depths import view_depths
+    from stages.geometry.start import start_from_cameras
+
+    config: AlignConfig = context.config
+    if config.hold_poses or len(start.cameras) < 2:
+        return start
+    hold_focals, shared = _focal_rules(config, views, start)
+    context.progress("match", 0, 1)
+    bundle = refine_with_matches(
+        {view.name: view.gray() for view in views.views},
+        {view.name: view.valid() for view in views.views},
+        start.cameras,
+        view_depths(pairs, start),
+        BundleOptions(
+            features=config.match_features,
+            search_px=config.match_search_px,
+            max_tracks=config.match_points,
+            ratio=config.match_ratio,
+            max_angle=config.match_max_angle,
+            max_error_px=config.match_max_error,
+            min_matches=config.match_min,
+            min_gain=config.match_min_gain,
+            free_focals=not hold_focals and len(start.cameras) >= config.match_focals_from,
+            shared_focal=shared,
+        ),
+    )
+    context.progress("match", 1, 1)
+    figures["matched_points"] = bundle.tracks
+    if bundle.reason:
+        return start
+    figures["reprojection_error_px"] = round(bundle.after, 3)
+    options = AlignOptions(
+        iterations=config.iterations, samples=config.samples, tolerance=config.tolerance,
+        huber=config.huber, free_focals=False, free_poses=False,
+    )  # fmt: skip
+    return optimise(pairs, start_from_cameras(pairs, bundle.cameras), options)[0]
+
+
+def _back_in_world(start, given):  # type: ignore[no-untyped-def]
+    """Optimised cameras in the world of those given: the frame that is known of it still holds."""
+    from stages.geometry.start import Start
+    from stages.geometry.world import move_camera, similarity_between
+
+    known = given.by_name()
+    names = sorted(start.cameras)
+    motion = similarity_between(
+        [start.cameras[name] for name in names], [known[name] for name in names]
+    )
+    scale, turn, shift = motion
+    pairs = [
+        pair and (scale * pair[0], turn @ pair[1], scale * turn @ pair[2] + shift)
+        for pair in start.pair_from
+    ]
+    cameras = {name: move_camera(start.cameras[name], motion) for name in names}
+    return Start(cameras, pairs)
 
 
 def _checked(pair, by_name):  # type: ignore[no-untyped-def]

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from stages.align.geometry import (
+from stages.geometry.similarity import (
     pose_from_points,
     robust_similarity,
     similarity,
     weiszfeld_focal,
 )
-from stages.align.start import spanning_tree
-from stages.align.world import move_camera, normalising_similarity
+from stages.geometry.start import spanning_tree
+from stages.geometry.world import move_camera, normalising_similarity
 
 RNG = np.random.default_rng(0)
 TURN = Rotation.from_euler("xyz", [20, -35, 10], degrees=True).as_matrix()

@@ -17,10 +17,10 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext, get_stage
-from stages.align.depths import view_depths
 from stages.align.fusion import FusionOptions, fuse
 from stages.align.stage import AlignConfig, AlignStage
-from stages.align.start import start_from_cameras, start_from_tree
+from stages.geometry.depths import view_depths
+from stages.geometry.start import start_from_cameras, start_from_tree
 
 _spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
 assert _spec is not None and _spec.loader is not None

@@ -42,6 +42,29 @@ def normalising_similarity(
     return scale, rotation, -scale * centre
 
 
+def similarity_between(
+    cameras: Sequence[Camera], targets: Sequence[Camera]
+) -> tuple[float, Array, Array]:
+    """Similarity that brings cameras onto others of the same views, as well as it goes.
+
+    Args:
+        cameras, targets: the same views in the same order, at least two.
+
+    Returns:
+        (scale, rotation [3, 3], translation [3]) of target = s R camera + t.
+    """
+    centres = np.array([camera.centre for camera in cameras])
+    goals = np.array([camera.centre for camera in targets])
+    centre, goal = centres.mean(0), goals.mean(0)
+    spread = np.linalg.norm(centres - centre)
+    scale = float(np.linalg.norm(goals - goal) / spread) if spread > 1e-12 else 1.0
+    # Orientations: R_target = R_camera R^T; the nearest rotation to all of them.
+    product = sum(b.rotation.T @ a.rotation for a, b in zip(cameras, targets, strict=True))
+    u, _, vt = np.linalg.svd(np.asarray(product))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return scale, rotation, goal - scale * rotation @ centre
+
+
 def move_camera(camera: Camera, motion: tuple[float, Array, Array]) -> Camera:
     """The camera in the world that (scale, rotation, translation) leads to, depths times scale."""
     scale, rotation, shift = motion

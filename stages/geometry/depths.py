@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.pointmaps import PointmapPair
-from stages.align.start import Start
+from stages.geometry.start import Start
 
 Array = npt.NDArray[np.float32]
 

@@ -1,0 +1,124 @@
+"""Sparse matches correct what bent pointmaps get wrong, and leave the rest alone."""
+
+from __future__ import annotations
+
+from importlib import util
+from itertools import permutations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
+from pipeline.artifacts.views import View, Views
+from pipeline.stage import LocalContext
+from stages.align.bundle import BundleOptions, refine_with_matches
+from stages.align.optimise import AlignOptions, optimise
+from stages.align.stage import AlignConfig, AlignStage
+from stages.geometry.depths import view_depths
+from stages.geometry.start import start_from_tree
+
+_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
+assert _spec is not None and _spec.loader is not None
+scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(scene)
+
+SIZE = (320, 240)
+
+
+@pytest.fixture(scope="module")
+def world():
+    """Three views whose texture is fine enough for features."""
+    cameras = [scene.camera(f"{k:03d}", a, *SIZE) for k, a in enumerate((-10.0, 0.0, 10.0))]
+    rendered = [scene.render(camera) for camera in cameras]
+    images = []
+    for camera, (_, depth) in zip(cameras, rendered, strict=True):
+        points = camera.unproject(depth)
+        images.append(scene.texture(2.5 * points).astype(np.float32))
+    return cameras, images, [depth for _, depth in rendered]
+
+
+def pointmaps(world, bent: float, noise: float = 0.003) -> list[PointmapPair]:
+    """Pairs whose depth is wrong by a smooth factor of its own, and noisy."""
+    cameras, _, depths = world
+    rng = np.random.default_rng(7)
+    pairs = []
+    for i, j in permutations(range(3), 2):
+        maps = []
+        for v in (i, j):
+            factor = cv2.resize(rng.normal(size=(3, 4)), SIZE, interpolation=cv2.INTER_CUBIC)
+            points = cameras[v].unproject(depths[v] * (1 + bent * factor))
+            points = points @ cameras[i].rotation.T + cameras[i].translation
+            maps.append((points + noise * 4 * rng.normal(size=points.shape)).astype(np.float32))
+        trust = np.full(depths[0].shape, 5, np.float32)
+        pairs.append(PointmapPair(f"{i:03d}", f"{j:03d}", *maps, trust, trust))
+    return pairs
+
+
+def aligned(world, bent: float):
+    pairs = pointmaps(world, bent)
+    start, _ = optimise(pairs, start_from_tree(pairs), AlignOptions(shared_focal=True))
+    grays = {
+        camera.name: View(camera.name, image).gray()
+        for camera, image in zip(world[0], world[1], strict=True)
+    }
+    masks = {name: np.ones(gray.shape, bool) for name, gray in grays.items()}
+    return start.cameras, (grays, masks, start.cameras, view_depths(pairs, start))
+
+
+def turned(found: dict[str, Camera], truth: list[Camera]) -> float:
+    """Largest error of a rotation between two views, degrees."""
+    largest = 0.0
+    for a, b in permutations(truth, 2):
+        ours = found[b.name].rotation @ found[a.name].rotation.T
+        error = ours @ (b.rotation @ a.rotation.T).T
+        largest = max(largest, float(np.degrees(Rotation.from_matrix(error).magnitude())))
+    return largest
+
+
+def test_matches_correct_bent_pointmaps(world):
+    before, given = aligned(world, 0.03)
+    bundle = refine_with_matches(*given, BundleOptions(min_matches=40))
+    assert not bundle.reason
+    assert bundle.tracks > 60
+    assert bundle.after < 0.5 * bundle.before
+    assert turned(before, world[0]) > 0.3
+    assert turned(bundle.cameras, world[0]) < 0.5 * turned(before, world[0])
+    for name, camera in bundle.cameras.items():
+        assert camera.fx == before[name].fx
+    again = refine_with_matches(*given, BundleOptions(min_matches=40))
+    for name, camera in bundle.cameras.items():
+        np.testing.assert_array_equal(again.cameras[name].cam_from_world, camera.cam_from_world)
+
+
+def test_good_cameras_and_scarce_matches_stay(world):
+    before, given = aligned(world, 0.0)
+    bundle = refine_with_matches(*given, BundleOptions(min_matches=40))
+    assert bundle.reason == "they agree with the pointmaps"
+    assert bundle.cameras == before
+    bundle = refine_with_matches(*given, BundleOptions(min_matches=100_000))
+    assert "in view" in bundle.reason
+    assert bundle.cameras == before
+
+
+def test_no_features_outside_the_mask(world):
+    _, (grays, masks, cameras, depths) = aligned(world, 0.03)
+    covered = {name: np.zeros_like(mask) for name, mask in masks.items()}
+    bundle = refine_with_matches(grays, covered, cameras, depths, BundleOptions())
+    assert bundle.tracks == 0
+
+
+def test_the_stage_uses_matches_where_cameras_come_from_pointmaps_alone(world, tmp_path):
+    views = Views(tuple(View(c.name, i) for c, i in zip(world[0], world[1], strict=True)))
+    given = {"views": views, "pointmaps": Pointmaps(pointmaps(world, 0.03))}
+    errors = {}
+    for matches in ("auto", "never"):
+        config = AlignConfig(matches=matches, match_min=40, shared_focal="always")
+        context = LocalContext(config, tmp_path / matches, given, threads=2)
+        AlignStage().run(context)
+        errors[matches] = turned(context.result("cameras").by_name(), world[0])
+        assert ("matched_points" in context.figures) == (matches == "auto")
+    assert errors["auto"] < 0.5 * errors["never"]
