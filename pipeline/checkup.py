@@ -178,9 +178,11 @@ def _stages() -> Iterator[Finding]:
         yield Finding("stages", "problem", "none registered", "pip install -c constraints.txt -e .")
     for name in names:
         try:
-            get_stage(name)
+            stage = get_stage(name)
         except PipelineError as error:
             yield Finding(f"stage {name}", "problem", str(error))
+        else:
+            yield from stage.findings()
     yield Finding("stages", "ok", ", ".join(names))
 
 

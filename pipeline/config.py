@@ -193,12 +193,25 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
             f"'{dotted}' is not a setting.{nearest(location[-1], fields)} The settings"
             f"{' of ' + prefix if prefix else ''} are {', '.join(fields)}."
         )
-    name = next((part for part in location if part in model.model_fields), None)
-    about = model.model_fields[name].description if name else None
+    about = _description(model, location)
     return (
         f"{dotted}={error.get('input')!r} is not allowed: {error['msg']}."
         f"{f' It means: {about}' if about else ''}"
     )
+
+
+def _description(model: type[BaseModel], location: list[str]) -> str | None:
+    """What the innermost field at a location is for."""
+    about = None
+    for part in location:
+        if part not in model.model_fields:
+            break
+        about = model.model_fields[part].description
+        inner = model.model_fields[part].annotation
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            break
+        model = inner
+    return about
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import contextlib
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.artifacts import Artifact, artifact_class
 from pipeline.errors import RequestError, nearest
+
+if TYPE_CHECKING:
+    from pipeline.checkup import Finding
 
 ENTRY_POINT_GROUP = "dentalsplat.stages"
 
@@ -121,6 +124,10 @@ class Stage(ABC):
             A stable label for each file (no folders: a moved case is the same case) -> its path.
         """
         return {}
+
+    def findings(self) -> Iterable[Finding]:
+        """What `pipeline doctor` should say of this stage: optional parts that are there or not."""
+        return ()
 
     @abstractmethod
     def run(self, context: StageContext) -> None:

@@ -88,12 +88,14 @@ class Cameras(Artifact):
         input_from_world: [4, 4] similarity from our world to the frame of known input (a COLMAP
             model, `transforms.json`, millimetres); identity where nothing is known.
         units: ``"arbitrary"`` or ``"mm"``, of the frame that `input_from_world` leads to.
+        provisional: only chained together, without any optimisation; `align` improves them.
     """
 
     kind: ClassVar[str] = "cameras"
     cameras: tuple[Camera, ...]
     input_from_world: Array = field(default_factory=lambda: np.eye(4))
     units: str = "arbitrary"
+    provisional: bool = False
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -103,9 +105,12 @@ class Cameras(Artifact):
 
     def save(self, folder: Path) -> None:
         reconstruction(self.cameras).write_text(str(folder))
-        text = json.dumps(
-            {"units": self.units, "input_from_world": self.input_from_world.tolist()}, indent=1
-        )
+        frame = {
+            "units": self.units,
+            "input_from_world": self.input_from_world.tolist(),
+            "provisional": self.provisional,
+        }
+        text = json.dumps(frame, indent=1)
         (folder / "frame.json").write_text(text + "\n")
 
     @classmethod
@@ -119,6 +124,7 @@ class Cameras(Artifact):
             cameras=cameras,
             input_from_world=np.asarray(frame["input_from_world"], np.float64),
             units=frame["units"],
+            provisional=frame.get("provisional", False),
         )
 
 

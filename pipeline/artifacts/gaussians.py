@@ -1,10 +1,14 @@
-"""`gaussians`: the fitted 3D Gaussians, as the standard 3DGS `.ply` (62 properties)."""
+"""`gaussians`: the fitted 3D Gaussians, as the standard 3DGS `.ply` (62 properties).
+
+Gaussians fitted with a light beside the lens have a second file, `light.safetensors`, with what
+spherical harmonics can't express; a viewer that knows the `.ply` alone shows the harmonics.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +23,35 @@ SH_COEFFICIENTS = 16
 
 
 @dataclass(frozen=True)
+class Light:
+    """Gaussians as a light beside the lens shows them (see `stages.splatting.light`).
+
+    Attributes:
+        albedo: [N, 3] float32, colour before the light, in the images' encoding (about 0..1).
+        normals: [N, 3] float32 unit vectors, world.
+        diffuse_share: k in 1 - k + k n.v, 0..1.
+        falloff: exponent of the distance.
+        distance: where the falloff is 1, world units.
+        widths: exponents m of the narrow and the broad highlight lobe exp(m (n.v - 1)).
+        strengths: of the two lobes, in linear light.
+        gamma: of the images' encoding.
+    """
+
+    albedo: Array
+    normals: Array
+    diffuse_share: float
+    falloff: float
+    distance: float
+    widths: tuple[float, float]
+    strengths: tuple[float, float]
+    gamma: float = 2.2
+
+    def __getitem__(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.integer]) -> Light:
+        """The light of the Gaussians that a boolean mask [N] or an index array selects."""
+        return replace(self, albedo=self.albedo[index], normals=self.normals[index])
+
+
+@dataclass(frozen=True)
 class Gaussians(Artifact):
     """Gaussians in world coordinates, parametrised as 3DGS stores them.
 
@@ -28,6 +61,8 @@ class Gaussians(Artifact):
         log_scales: [N, 3] float32, natural logarithm of the standard deviations.
         logit_opacities: [N] float32.
         sh: [N, 16, 3] float32; coefficient 0 is the constant (f_dc), colour = .5 + sum(sh * basis).
+        light: what shows them better than `sh` where a light beside the lens lit the scene, or
+            None.
     """
 
     kind: ClassVar[str] = "gaussians"
@@ -36,16 +71,21 @@ class Gaussians(Artifact):
     log_scales: Array
     logit_opacities: Array
     sh: Array
+    light: Light | None = None
 
     def __len__(self) -> int:
         return len(self.means)
 
     def save(self, folder: Path) -> None:
         write_gaussians_ply(folder / "gaussians.ply", self)
+        if self.light is not None:
+            write_light(folder / "light.safetensors", self.light)
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        return cls(**read_gaussians_ply(folder / "gaussians.ply"))
+        lit = folder / "light.safetensors"
+        light = read_light(lit) if lit.exists() else None
+        return cls(**read_gaussians_ply(folder / "gaussians.ply"), light=light)
 
 
 def ply_properties() -> list[str]:
@@ -94,3 +134,34 @@ def read_gaussians_ply(path: Path) -> dict[str, Array]:
         "logit_opacities": np.array(vertex["opacity"], np.float32),
         "sh": sh,
     }
+
+
+#: fields of `Light` that are one number or two, in the order of the tensor `scene`
+LIGHT_SCENE = ("diffuse_share", "falloff", "distance", "gamma")
+
+
+def write_light(path: Path, light: Light) -> None:
+    """Write tensors `albedo`, `normals` [N, 3], `lobes` [2, 2] (width, strength), `scene` [4]."""
+    from safetensors.numpy import save_file
+
+    scene = [getattr(light, name) for name in LIGHT_SCENE]
+    tensors: dict[str, npt.NDArray[Any]] = {
+        "albedo": np.ascontiguousarray(light.albedo, np.float32),
+        "normals": np.ascontiguousarray(light.normals, np.float32),
+        "lobes": np.stack([light.widths, light.strengths], 1).astype(np.float64),
+        "scene": np.array(scene, np.float64),
+    }
+    save_file(tensors, path, {"scene": ",".join(LIGHT_SCENE)})
+
+
+def read_light(path: Path) -> Light:
+    """Read what `write_light` wrote."""
+    from safetensors.numpy import load_file
+
+    tensors = load_file(path)
+    lobes = tensors["lobes"].tolist()
+    scene = dict(zip(LIGHT_SCENE, tensors["scene"].tolist(), strict=True))
+    return Light(
+        albedo=tensors["albedo"], normals=tensors["normals"],
+        widths=(lobes[0][0], lobes[1][0]), strengths=(lobes[0][1], lobes[1][1]), **scene,
+    )  # fmt: skip

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.stage import StageConfig, runtime
 from stages.init.dense.options import DenseOptions
+from stages.init.dental.arch_options import ArchOptions
+from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.pointmap.options import PointmapOptions
 
-#: Dense stereo's defaults are said once, where they were measured.
+#: Defaults are said once, where they were measured.
 DENSE = DenseOptions()
+ARCH = ArchOptions()
+SURFACE = SurfaceOptions()
+POINTMAPS = PointmapOptions()
 
 
 class DenseConfig(StageConfig):
@@ -79,6 +86,116 @@ class DenseConfig(StageConfig):
     )
 
 
+class PointmapConfig(StageConfig):
+    """Pointmaps of a learned model, or made elsewhere."""
+
+    checkpoint: str | None = runtime(
+        None, description="the model's weights, a file or folder; nothing is ever downloaded"
+    )
+    package: str | None = Field(None, description="Python package, if not the model's usual one")
+    package_folder: str | None = runtime(
+        None, description="a checkout to import the package from, if it is not installed"
+    )
+    files: str | None = runtime(None, description="folder of .npz pointmaps, for method files")
+    file_names: Literal["auto", "source", "neutral"] = Field(
+        "auto", description="what their names say: photographs' file names, or 000, 001, ..."
+    )
+    device: str = Field("auto", description="auto (CUDA if there), cpu, cuda, cuda:1, ...")
+    long_side: int = Field(
+        POINTMAPS.long_side, ge=64, le=4096, description="image size for dust3r, mast3r, must3r"
+    )
+    graph: Literal["auto", "complete", "window", "star"] = Field(
+        "auto", description="pairs: all, each view with the next ones, or all with one"
+    )
+    complete_up_to: int = Field(
+        POINTMAPS.complete_up_to, ge=2, le=1000, description="views up to which auto takes all"
+    )
+    window: int = Field(POINTMAPS.window, ge=1, le=1000, description="next views to pair with")
+    reference: int | None = Field(None, ge=0, description="centre of a star; null: the middle one")
+    symmetric: bool = Field(True, description="ask pairwise models in both orders")
+    max_memory_gb: float | None = runtime(
+        None, gt=0, description="refuse to start above this; null: what is free"
+    )
+    edge_jump: float = Field(
+        POINTMAPS.edge_jump, gt=0, le=1, description="relative distance between two surfaces"
+    )
+
+    @property
+    def paths(self) -> dict[str, Path | None]:
+        """The fields that are paths of the user's."""
+        names = ("checkpoint", "package_folder", "files")
+        given = {name: getattr(self, name) for name in names}
+        return {name: Path(path).expanduser() if path else None for name, path in given.items()}
+
+
+class ToothConfig(StageConfig):
+    """The number of one tooth, as a person knows it."""
+
+    photo: str = Field(description="file name of the photograph")
+    x: float = Field(description="a point on the crown, pixels of that photograph (upright)")
+    y: float = Field(description="a point on the crown, pixels of that photograph (upright)")
+    tooth: int = Field(ge=11, le=47, description="its FDI number")
+
+
+class DentalConfig(StageConfig):
+    """Wide photographs of teeth: the teeth are the landmarks."""
+
+    order: tuple[Literal["right", "frontal", "left", "between"], ...] | None = Field(
+        None,
+        description="what each photograph shows, in the order of the file names: right or left "
+        "buccal, frontal, between; null: found out",
+    )
+    labels: tuple[ToothConfig, ...] = Field((), description="teeth whose number is known")
+    tooth_widths: dict[int, Annotated[float, Field(gt=2, lt=20)]] = Field(
+        {}, description="known mesiodistal widths in mm by FDI number, for the scale"
+    )
+    missing: tuple[int, ...] = Field((), description="FDI numbers of teeth that are not there")
+    focal_per_side: float = Field(
+        ARCH.focal_per_side, ge=0.3, le=10, description="focal length expected over the long side"
+    )
+    focal_deviation: float = Field(
+        ARCH.focal_deviation, gt=0, le=1, description="its relative standard deviation"
+    )
+    distance: float = Field(ARCH.distance, gt=20, le=2000, description="camera distance, mm")
+    distance_deviation: float = Field(
+        ARCH.distance_deviation, gt=0, le=1, description="its relative standard deviation"
+    )
+    side_yaw: float = Field(ARCH.side_yaw, ge=5, le=90, description="yaw of side views, degrees")
+    landmark_deviation: float = Field(
+        ARCH.landmark_deviation, gt=0, le=10,
+        description="how far teeth lie from the textbook arch, mm",
+    )  # fmt: skip
+    dense_rounds: int = Field(
+        ARCH.dense_rounds, ge=0, le=10, description="rounds of matching on the unrolled arch"
+    )
+    min_margin: float = Field(
+        ARCH.min_margin, ge=0, description="least lead of a labelling over the next one"
+    )
+    max_error: float = Field(
+        ARCH.max_error, gt=0, le=1, description="largest landmark error over the band of teeth"
+    )
+    accept_doubtful: bool = Field(
+        False, description="go on with a doubtful result; the doubts become warnings"
+    )
+    gum_height: float = Field(
+        SURFACE.gum_height, ge=0, le=20, description="gum shown beyond the crowns, mm"
+    )
+    cloud_spacing: float = Field(
+        SURFACE.cloud_spacing, ge=0.03, le=2, description="distance of the points, mm"
+    )
+    chart_density: float = Field(
+        SURFACE.chart_density, ge=4, le=30, description="samples per mm of the dense surface"
+    )
+    mask_rest: bool = Field(
+        True, description="mask what is not teeth or gum: gloves, lips, retractors"
+    )
+
+    @field_validator("order", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return tuple(part.strip() for part in value.split(",")) if isinstance(value, str) else value
+
+
 class LengthConfig(StageConfig):
     """A length that is known, such as the width of a tooth, to give the scene its scale."""
 
@@ -93,9 +210,10 @@ class LengthConfig(StageConfig):
 class InitConfig(StageConfig):
     """How cameras and first points are found."""
 
-    method: Literal["auto", "colmap", "dental", "known"] = Field(
-        "auto", description="how to find the cameras"
-    )
+    method: Literal[
+        "auto", "known", "colmap", "dental",
+        "dust3r", "mast3r", "must3r", "vggt", "mapanything", "files",
+    ] = Field("auto", description="how to find the cameras")  # fmt: skip
     cameras: str | None = runtime(
         None,
         description="cameras that are known: folder of a COLMAP model, or a transforms.json; the "
@@ -152,5 +270,11 @@ class InitConfig(StageConfig):
     )
     min_dense_points: int = Field(
         5000, ge=0, description="with fewer dense points the sparse ones are added"
+    )
+    pointmap: PointmapConfig = Field(
+        PointmapConfig.model_validate({}), description="learned models and pointmap files"
+    )
+    dental: DentalConfig = Field(
+        DentalConfig.model_validate({}), description="wide photographs of teeth"
     )
     dense: DenseConfig = Field(DenseConfig.model_validate({}), description="dense stereo")

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.views import View
-from pipeline.errors import RequestError
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import RequestError, nearest
 
 Array = npt.NDArray[np.float64]
+
+
+def photo_named(views: Views, name: str, setting: str = "init.length.photo") -> View:
+    """The photograph that the user means.
+
+    Raises:
+        RequestError: there is none.
+    """
+    names = {view.source_name: view for view in views.views}
+    names |= {Path(view.source_name).stem: view for view in views.views} | views.by_name() | names
+    if name not in names:
+        raise RequestError(f"{setting}: there is no photograph '{name}'.{nearest(name, names)}")
+    return names[name]
 
 
 def mm_per_unit(

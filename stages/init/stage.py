@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pipeline.artifacts.cameras import Cameras
-from pipeline.artifacts.pointmaps import Pointmaps
-from pipeline.artifacts.views import View, Views
-from pipeline.errors import RequestError, nearest
+from pipeline.artifacts.views import Views
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import Stage, StageContext
 from stages.init.config import InitConfig
 
 if TYPE_CHECKING:
+    from pipeline.checkup import Finding
     from stages.init.options import ClassicalOptions
-    from stages.init.placement import Placement
+    from stages.init.pointmap.options import PointmapOptions
+
+
+#: How few and how many photographs the dental path takes on its own accord.
+DENTAL_VIEWS = (3, 12)
 
 
 class InitStage(Stage):
@@ -33,27 +35,55 @@ class InitStage(Stage):
     may_provide = ("views", "pictures")  # undistorted; labelled teeth
     libraries = ("pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
     methods = {  # noqa: RUF012
-        "auto": "known where init.cameras is given, else colmap, else dental if teeth are found",
+        "auto": "known where init.cameras is given; a model where init.pointmap.checkpoint is "
+        "given and one is installed; else colmap, and dental if that fails and teeth are found",
         "known": "cameras from a COLMAP model or transforms.json (init.cameras); dense stereo",
         "colmap": "yaw-compensated SIFT, COLMAP's mappers, plane-sweep stereo; no network needed",
+        "dental": "wide photographs of teeth: the teeth are the landmarks; a dense surface of them",
+        "mapanything": "MapAnything, if installed",
+        "vggt": "VGGT, if installed",
+        "must3r": "MUSt3R, if installed",
+        "mast3r": "MASt3R, if installed",
+        "dust3r": "DUSt3R, if installed",
+        "files": "pointmaps made elsewhere, as .npz (init.pointmap.files)",
     }
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
         from stages.init.known import model_files
 
-        if config.cameras is None:
-            if config.method == "known":
+        if config.cameras is not None:
+            if config.method not in ("auto", "known"):
                 raise RequestError(
-                    "init.method is known, but no cameras are given. Pass --set init.cameras=PATH "
-                    "with the folder of a COLMAP model or a transforms.json."
+                    f"init.cameras is given, but init.method={config.method} would not use it. "
+                    "Leave one of them out."
                 )
-            return {}
-        if config.method not in ("auto", "known"):
+            return model_files(Path(config.cameras))
+        if config.method == "known":
             raise RequestError(
-                f"init.cameras is given, but init.method={config.method} would not use it. Leave "
-                "one of them out."
+                "init.method is known, but no cameras are given. Pass --set init.cameras=PATH with "
+                "the folder of a COLMAP model or a transforms.json."
             )
-        return model_files(Path(config.cameras))
+        options = _pointmap_options(config)
+        if options is None:
+            return {}
+        from stages.init.pointmap.predict import source_files
+
+        return source_files(options)
+
+    def findings(self) -> Iterable[Finding]:
+        from pipeline.checkup import Finding
+        from stages.init.pointmap.predict import available, cards
+
+        installed = set(available())
+        for card in cards():
+            there = card.name in installed
+            yield Finding(
+                f"init.method {card.name}", "ok" if there else "note",
+                f"{card.title} is {'installed' if there else 'not installed (optional)'}; weights: "
+                f"{card.weights_licence}",
+                f"--set init.method={card.name} --set init.pointmap.checkpoint=FILE" if there
+                else card.install,
+            )  # fmt: skip
 
     def run(self, context: StageContext) -> None:
         """Place the views, densify, and write what came out.
@@ -61,26 +91,87 @@ class InitStage(Stage):
         Raises:
             ReconstructionError: the photographs don't allow it; the message says why.
         """
-        from stages.init.place import place_classical, with_focals
+        from stages.init.scale import photo_named
 
         config: InitConfig = context.config
         views: Views = context.load("views")
         if config.length.mm is not None:
-            _photo(views, config.length.photo)  # a wrong name is said before the work is done
-        options = _classical_options(config)
-        if context.sources:
-            placement = _place_known(context, views, options)
-        else:
-            from stages.init.diagnosis import least_views
+            photo_named(views, config.length.photo)  # a wrong name is said before the work is done
+        if config.cameras is not None:
+            _from_known_cameras(context, views)
+        elif pointmaps := _pointmap_options(config):
+            _from_pointmaps(context, views, pointmaps)
+        elif config.method == "dental":
+            from stages.init.teeth import from_teeth
 
-            placement = place_classical(
-                list(views.views), with_focals(views.views, config.focal),
-                config.focal is not None, views.ordered,
-                least_views(len(views), config.min_views_fraction), options,
-                seed=context.seed, threads=context.threads, scratch=context.scratch,
-                progress=context.progress, warn=context.warn,
-            )  # fmt: skip
-        _densify(context, views, placement.normalised())
+            from_teeth(context, views)
+        else:
+            _from_features(context, views)
+
+
+def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
+    """How to ask a pointmap model, or None where the method is another."""
+    from stages.init.pointmap.options import METHODS, PointmapOptions
+    from stages.init.pointmap.predict import available
+
+    method: str = config.method
+    if method == "auto" and config.pointmap.checkpoint is not None:
+        found = available()
+        if len(found) > 1:
+            raise RequestError(
+                f"Several pointmap models are installed ({', '.join(found)}). Say whose weights "
+                f"init.pointmap.checkpoint are, as in --set init.method={found[0]}."
+            )
+        method = found[0] if found else "colmap"
+    if method not in METHODS:
+        return None
+    settings = config.pointmap.model_dump() | config.pointmap.paths
+    return PointmapOptions(method=method, **settings)
+
+
+def _from_features(context: StageContext, views: Views) -> None:
+    from stages.init.diagnosis import least_views
+    from stages.init.place import place_classical, with_focals
+    from stages.init.write import densify
+
+    config: InitConfig = context.config
+    try:
+        placement = place_classical(
+            list(views.views), with_focals(views.views, config.focal), config.focal is not None,
+            views.ordered, least_views(len(views), config.min_views_fraction),
+            _classical_options(config), seed=context.seed, threads=context.threads,
+            scratch=context.scratch, progress=context.progress, warn=context.warn,
+        )  # fmt: skip
+    except ReconstructionError as unplaced:
+        if config.method != "auto" or not _teeth_are_worth_a_try(views, context.threads):
+            raise
+        _from_teeth_instead(context, views, unplaced)
+    else:
+        densify(context, views, placement.normalised())
+
+
+def _teeth_are_worth_a_try(views: Views, threads: int) -> bool:
+    """Few photographs, and of teeth: the dental path may place what features could not."""
+    from stages.init.dental.photo import teeth_likely
+
+    images = [view.image for view in views.views]
+    valid = [view.valid() for view in views.views]
+    few = DENTAL_VIEWS[0] <= len(views) <= DENTAL_VIEWS[1]
+    return few and teeth_likely(images, valid, threads=threads)
+
+
+def _from_teeth_instead(context: StageContext, views: Views, unplaced: ReconstructionError) -> None:
+    from stages.init.teeth import from_teeth
+
+    context.progress("features do not link the photographs; trying the teeth", 0, 1)
+    try:
+        from_teeth(context, views)
+    except ReconstructionError as doubtful:
+        raise ReconstructionError(
+            f"Neither the texture nor the teeth place these photographs safely. By texture: "
+            f"{unplaced} By teeth: {doubtful}",
+            doubtful.pictures,
+        ) from doubtful
 
 
 def _classical_options(config: InitConfig) -> ClassicalOptions:
@@ -91,123 +182,49 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
     )
 
 
-def _place_known(context: StageContext, views: Views, options: ClassicalOptions) -> Placement:
+def _from_known_cameras(context: StageContext, views: Views) -> None:
     from stages.init.known import matching_cameras, read_cameras
     from stages.init.place import place_known
+    from stages.init.write import densify
 
     config: InitConfig = context.config
     cameras, units = read_cameras(context.sources.values())
-    return place_known(
+    placement = place_known(
         list(views.views), matching_cameras(cameras, views.views),
-        units if config.units == "auto" else config.units, views.ordered, options,
-        threads=context.threads, progress=context.progress, warn=context.warn,
+        units if config.units == "auto" else config.units, views.ordered,
+        _classical_options(config), threads=context.threads, progress=context.progress,
+        warn=context.warn,
     )  # fmt: skip
+    densify(context, views, placement.normalised())
 
 
-def _photo(views: Views, name: str) -> View:
-    """The photograph that the user means.
-
-    Raises:
-        RequestError: there is none.
-    """
-    names = {view.source_name: view for view in views.views}
-    names |= {Path(view.source_name).stem: view for view in views.views} | views.by_name() | names
-    if name not in names:
-        raise RequestError(
-            f"init.length.photo: there is no photograph '{name}'.{nearest(name, names)}"
-        )
-    return names[name]
-
-
-def _densify(context: StageContext, views: Views, placement: Placement) -> None:
-    """Dense stereo from the cameras found, and everything written."""
-    from stages.init import cloud
-    from stages.init.dense import DenseOptions, dense_depths
-    from stages.init.geometry import spanning_tree
+def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:
+    from stages.init.place import photo_name, with_focals
+    from stages.init.pointmap.predict import predict_pointmaps
+    from stages.init.pointmap.quick_start import quick_start
+    from stages.init.write import save_all
 
     config: InitConfig = context.config
-    cameras, points = placement.cameras, placement.points
-    images = [view.image for view in placement.views]
-    dense = dense_depths(
-        images,
-        [view.valid() for view in placement.views],
-        list(cameras),
-        [points[seen].astype(np.float32) for seen in placement.seen],
-        DenseOptions(**config.dense.model_dump()),
-        context.threads,
-        lambda done, total: context.progress("dense stereo", done, total),
+    pairs = predict_pointmaps(
+        views.views, views.ordered, options, context.progress, context.threads
     )
-    clouds = [
-        cloud.depth_points(image, found.depth, found.normal, found.confidence, camera)
-        for image, found, camera in zip(images, dense, cameras, strict=True)
-    ]
-    dense_count = sum(len(found) for found in clouds)
-    if dense_count < config.min_dense_points:
-        context.warn(
-            f"Dense stereo found only {dense_count} points; the {len(points)} points of the sparse "
-            "reconstruction are added. The surface will have holes."
-        )
-        clouds.append(cloud.sparse_points(points, images, list(cameras)))
-    if config.fill_step:
-        for image, found, camera in zip(images, dense, cameras, strict=True):
-            rest = np.where(found.depth > 0, np.float32(0), found.filled)
-            clouds.append(
-                cloud.depth_points(
-                    image, rest, found.normal, found.confidence, camera, config.fill_step
-                )
-            )
-    result = cloud.thinned(cloud.joined(clouds), config.max_points, context.seed)
-    depths = [np.where(found.depth > 0, found.depth, found.filled) for found in dense]
-    tree = spanning_tree(placement.weights, len(cameras))
-    pairs = [
-        cloud.pointmap_pair(
-            cameras[i], cameras[j], depths[i], depths[j], dense[i].confidence, dense[j].confidence
-        )
-        for i, j in cloud.pointmap_edges(placement.weights, tree, len(cameras))
-    ]
-    _save_cameras(context, views, placement, depths)
-    context.save(result)
-    context.save(Pointmaps(pairs))
-    context.summarize(
-        views_registered=len(cameras),
-        views_total=len(views),
-        focal=round(float(np.median([c.fx / max(c.width, c.height) for c in cameras])), 4),
-        sparse_points=len(points),
-        dense_points=dense_count,
-        points=len(result),
-        **placement.figures,
-    )
-
-
-def _save_cameras(
-    context: StageContext, views: Views, placement: Placement, depths: list[Any]
-) -> None:
-    """Write the cameras with the scale that is known, and the views if they were undistorted."""
-    from stages.init.scale import mm_per_unit
-
-    length = context.config.length
-    input_from_world, units = placement.input_from_world, placement.units
-    if length.mm is not None:
-        view = _photo(views, length.photo)
-        number = next((k for k, v in enumerate(placement.views) if v.name == view.name), None)
-        if number is None:
-            raise RequestError(
-                f"init.length.photo: {length.photo} could not be placed, so that nothing can be "
-                "measured in it. Name another photograph."
-            )
-        factor = mm_per_unit(
-            view, placement.cameras[number], depths[number], length.start, length.end, length.mm
-        )
-        scale = np.cbrt(np.linalg.det(input_from_world[:3, :3]))
-        input_from_world = np.diag([factor / scale] * 3 + [1.0]) @ input_from_world
-        units = "mm"
-        context.summarize(mm_per_unit=round(factor, 4))
-    context.save(Cameras(placement.cameras, input_from_world, units))
-    changed = {
-        view.name: view
-        for view in placement.views
-        if view.image is not views.by_name()[view.name].image
+    focals = {
+        view.name: focal
+        for view, focal in zip(views.views, with_focals(views.views, config.focal), strict=True)
+        if focal
     }
-    if changed:
-        context.save(replace(views, views=tuple(changed.get(v.name, v) for v in views.views)))
-        context.summarize(undistorted=len(changed))
+    start = quick_start(pairs, views.views, focals, max_points=config.max_points, seed=context.seed)
+    by_name = views.by_name()
+    if start.unplaced:
+        context.warn(
+            f"{len(start.unplaced)} of {len(views)} photographs could not be placed and are left "
+            f"out: {', '.join(photo_name(by_name[name]) for name in start.unplaced)}."
+        )
+    # A focal length that is known is written with the views, so that `align` holds it.
+    placed = tuple(
+        replace(view, focal_px=focals[view.name]) if config.focal else view
+        for view in (by_name[camera.name] for camera in start.cameras)
+    )
+    cameras = Cameras(start.cameras, provisional=True)  # `align` makes them better
+    save_all(context, views, placed, cameras, list(start.depths), start.points, pairs)
+    context.summarize(method=options.method, pairs=len(pairs))

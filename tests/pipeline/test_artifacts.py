@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from pipeline.artifacts import KINDS, Artifact, artifact_class
 from pipeline.artifacts.cameras import Camera, Cameras, read_colmap
 from pipeline.artifacts.flow import Flow, FlowPair
-from pipeline.artifacts.gaussians import Gaussians, ply_properties
+from pipeline.artifacts.gaussians import Gaussians, Light, ply_properties
 from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
@@ -64,7 +65,12 @@ def samples() -> dict[str, Artifact]:
         "points": Points(floats(9, 3), pixels(9, 3), floats(9, 3), 1 + floats(9), floats(9)),
         "flow": Flow((FlowPair("000", "001", floats(5, 7, 2), floats(8, 6, 2), mask, mask),)),
         "gaussians": Gaussians(
-            floats(9, 3), floats(9, 4), floats(9, 3), floats(9), floats(9, 16, 3)
+            floats(9, 3),
+            floats(9, 4),
+            floats(9, 3),
+            floats(9),
+            floats(9, 16, 3),
+            Light(floats(9, 3), floats(9, 3), 0.9, 2.1, 1.3, (97.0, 15.5), (0.45, 0.04)),
         ),
         "metrics": Metrics({"mean": {"psnr": 31.25}, "unplaced": []}),
         "pictures": Pictures({"matches": rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)}),
@@ -126,6 +132,18 @@ def test_projection_and_unprojection_are_inverse() -> None:
     np.testing.assert_allclose(z, 2.5)
     half, _ = camera.resized(14, 10).project(world.reshape(-1, 3))
     np.testing.assert_allclose(half, pixels * 2, atol=1e-9)
+
+
+def test_gaussians_without_light_are_one_file(tmp_path: Path) -> None:
+    lit = samples()["gaussians"]
+    plain = dataclasses.replace(lit, light=None)  # type: ignore[type-var]
+    plain.save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["gaussians.ply"]
+    assert Gaussians.load(tmp_path).light is None
+    lit.save(tmp_path)
+    light = Gaussians.load(tmp_path).light
+    assert light is not None and light.widths == (97.0, 15.5)
+    assert len(light[np.arange(4)].albedo) == 4
 
 
 def test_gaussian_ply_has_the_standard_properties(tmp_path: Path) -> None:

@@ -47,4 +47,15 @@ def test_no_stages_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_stage_of_the_project_can_be_imported() -> None:
-    assert [finding.level for finding in checkup._stages()] == ["ok"]
+    findings = list(checkup._stages())
+    assert findings[-1].name == "stages" and findings[-1].level == "ok"
+    assert not any(finding.level == "problem" for finding in findings)
+
+
+def test_optional_pointmap_models_are_named_with_their_licence() -> None:
+    told = {finding.name: finding for finding in checkup._stages()}
+    assert (
+        "licen" in told["init.method dust3r"].detail.lower()
+        or "CC" in told["init.method dust3r"].detail
+    )
+    assert "github.com" in told["init.method vggt"].mend

@@ -55,10 +55,11 @@ def sample_views():
     return Views(tuple(views))
 
 
-def run(tmp_path, sources, views=None, **config):
+def run(tmp_path, cameras, **settings):
+    config = InitConfig(cameras=str(cameras), **settings)
     context = LocalContext(
-        InitConfig(**config), tmp_path, inputs={"views": views or sample_views()},
-        sources=sources, threads=2,
+        config, tmp_path, inputs={"views": sample_views()},
+        sources=InitStage().sources(config, {}), threads=2,
     )  # fmt: skip
     InitStage().run(context)
     return context
@@ -86,8 +87,7 @@ def colmap_model(folder, model="PINHOLE", extra=(), names=None):
 
 
 def test_known_cameras_are_kept_and_the_depth_is_true(tmp_path):
-    config = InitConfig(cameras=str(SAMPLES / "transforms.json"))
-    context = run(tmp_path, InitStage().sources(config, {}))
+    context = run(tmp_path, SAMPLES / "transforms.json")
     cameras = context.result("cameras")
     assert cameras.units == "mm"
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
@@ -145,7 +145,7 @@ def test_distortion_is_taken_out_of_the_image(tmp_path):
 
 def test_distorted_model_gives_undistorted_views(tmp_path):
     folder = colmap_model(tmp_path / "model", "SIMPLE_RADIAL", (-0.05,))
-    context = run(tmp_path / "out", model_files(folder))
+    context = run(tmp_path / "out", folder)
     views = context.result("views")
     assert len(views) == 3 and context.figures["undistorted"] == 3
     assert any(
@@ -212,7 +212,7 @@ def test_cameras_of_other_photographs_are_noticed(tmp_path):
         assert camera.name
     shuffled.write_text(str(folder))
     with pytest.raises(ReconstructionError, match="do not fit the photographs"):
-        run(tmp_path / "out", model_files(folder))
+        run(tmp_path / "out", folder)
 
 
 def test_photographs_without_camera_are_named(tmp_path):
@@ -261,7 +261,7 @@ def test_known_length_gives_millimetres(tmp_path):
     mm = float(np.linalg.norm(places[0] - places[1]))
     folder = colmap_model(tmp_path / "model")
     length = {"mm": mm, "photo": "frontal", "start": tuple(start), "end": tuple(end)}
-    context = run(tmp_path / "out", model_files(folder), length=length)
+    context = run(tmp_path / "out", folder, length=length)
     cameras = context.result("cameras")
     assert cameras.units == "mm"
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
@@ -272,7 +272,7 @@ def test_known_length_gives_millimetres(tmp_path):
     ours = scale * np.linalg.norm(cameras.cameras[0].centre - cameras.cameras[2].centre)
     assert abs(ours / truth - 1) < 0.02
     with pytest.raises(RequestError, match=r"no photograph 'frontel'.*frontal"):
-        run(tmp_path / "wrong", model_files(folder), length={**length, "photo": "frontel"})
+        run(tmp_path / "wrong", folder, length={**length, "photo": "frontel"})
 
 
 def test_length_that_cannot_be_measured_is_refused():

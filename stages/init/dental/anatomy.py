@@ -30,8 +30,8 @@ class Landmark:
 
     Attributes:
         kind: `zenith`, the highest point of the gum line on a crown; `tip`, the middle of its
-            biting edge or cusp; `papilla`, the tip of the gum between two crowns; `embrasure`, where
-            two crowns part at the biting edge.
+            biting edge or cusp; `papilla`, the tip of the gum between two crowns; `embrasure`,
+            where two crowns part at the biting edge.
         tooth: FDI number; of a papilla or embrasure, that of the tooth nearer the patient's right.
         neighbour: the other tooth of a papilla or embrasure, else 0.
     """

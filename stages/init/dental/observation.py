@@ -50,8 +50,8 @@ class Dentition:
     Attributes:
         upper, lower: crowns from left to right (after the roll is taken out).
         mask: [H, W] bool, True on teeth (of the working image as it is, not turned).
-        above: [H, W] bool, True above the line where the jaws meet: where a pixel is tooth, it is an
-            upper one.
+        above: [H, W] bool, True above the line where the jaws meet: where a pixel is tooth, it is
+            an upper one.
         roll: radians by which the row of teeth is turned clockwise in the image.
         band_height: pixels from the upper to the lower gum line (median).
         doubts: sentences for the user about what is not as expected; empty where all is well.

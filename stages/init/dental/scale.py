@@ -1,0 +1,59 @@
+"""Millimetres from teeth whose width is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.errors import RequestError
+from stages.init.dental.anatomy import Landmark, teeth_of
+from stages.init.dental.solution import ArchFit
+
+#: Relative standard deviation of a crown's width as it comes out between its landmarks.
+WIDTH_DEVIATION = 0.04
+
+
+def crown_width(fit: ArchFit, tooth: int) -> float | None:
+    """Distance in mm of the arch frame between where a crown touches its two neighbours, if seen.
+
+    Contacts lie between papilla and embrasure; what was seen of either is taken.
+    """
+    order = teeth_of("upper" if tooth < 30 else "lower")
+    position = order.index(tooth)
+    if position in (0, len(order) - 1):
+        return None
+    widths = []
+    for kind in ("papilla", "embrasure"):
+        before = fit.landmarks.get(Landmark(kind, order[position - 1], tooth))  # type: ignore[arg-type]
+        after = fit.landmarks.get(Landmark(kind, tooth, order[position + 1]))  # type: ignore[arg-type]
+        if before is not None and after is not None:
+            widths.append(float(np.linalg.norm(after - before)))
+    return float(np.mean(widths)) if widths else None
+
+
+def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float, float]:
+    """True millimetres per millimetre of the arch frame, and the relative standard deviation.
+
+    Args:
+        widths: FDI number -> mesiodistal width in mm; none: the textbook's scale.
+
+    Raises:
+        RequestError: none of these teeth was seen with both its neighbours.
+    """
+    if not widths:
+        return 1.0, fit.scale_uncertainty
+    ratios = {
+        tooth: known / measured
+        for tooth, known in sorted(widths.items())
+        if tooth in (*teeth_of("upper"), *teeth_of("lower"))
+        and (measured := crown_width(fit, tooth)) is not None
+    }
+    if not ratios:
+        raise RequestError(
+            f"init.dental.tooth_widths: of the teeth named ({', '.join(map(str, sorted(widths)))}) "
+            "none was seen with both its neighbours, so that the scale can't be told. Name other "
+            "teeth, such as 11 or 21."
+        )
+    found = np.array(list(ratios.values()))
+    return float(np.median(found)), float(WIDTH_DEVIATION / np.sqrt(len(found)))

@@ -1,0 +1,238 @@
+"""The dense surface of the teeth, from a few wide photographs with known cameras.
+
+One chart per jaw: the crown shapes between their landmarks, swept until the photographs agree,
+coloured once from all photographs, and seen from each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from stages.init.dental.anatomy import Jaw
+from stages.init.dental.observation import Dentition
+from stages.init.dental.solution import ArchFit
+from stages.init.dental.surface_charts import (
+    PAST_EDGE,
+    Chart,
+    comparable,
+    confidence_of,
+    nearest_depths,
+    smooth_normals,
+    start_chart,
+)
+from stages.init.dental.surface_cloud import coloured_cloud
+from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface_photo import Photo, prepare_photo
+from stages.init.dental.surface_raster import raster_chart
+from stages.init.dental.surface_sweep import choose_pairs, sweep
+from stages.init.parallel import in_threads
+
+Array32 = npt.NDArray[np.float32]
+Array64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Progress = Callable[[str, int, int], None]
+
+#: The agreement found is smoothed over this length (mm).
+_AGREEMENT_SMOOTHING = 0.4
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """The surface seen from one photograph.
+
+    Attributes:
+        depth: [H, W] float32 z in mm, 0 where there is no tooth or gum.
+        normal: [H, W, 3] float32 unit vectors, arch frame; 0 where there is no depth.
+        confidence: [H, W] float32 >= 1; exactly 1 where there is no depth.
+    """
+
+    depth: Array32
+    normal: Array32
+    confidence: Array32
+
+
+@dataclass(frozen=True)
+class ArchSurface:
+    """The dense surface of both jaws, in the arch frame (mm).
+
+    Attributes:
+        views: one per photograph, None where it was not placed.
+        positions: [N, 3] float32.
+        colors: [N, 3] float32 sRGB in 0..1.
+        normals: [N, 3] float32 unit vectors.
+        confidence: [N] float32 >= 1.
+        tooth: [N] bool: on a crown, not on the gum.
+        faces: [F, 3] int32 triangles over the positions, counter-clockwise from outside.
+        gains: [V, 3] float64 factors that were applied to each photograph's colour (1 where None).
+    """
+
+    views: tuple[SurfaceView | None, ...]
+    positions: Array32
+    colors: Array32
+    normals: Array32
+    confidence: Array32
+    tooth: Mask
+    faces: npt.NDArray[np.int32]
+    gains: Array64
+
+
+def dense_surface(
+    images: list[Array32],
+    valid: list[Mask],
+    dentitions: list[Dentition | None],
+    fit: ArchFit,
+    options: SurfaceOptions | None = None,
+    threads: int = 1,
+    progress: Progress = lambda step, done, total: None,
+) -> ArchSurface:
+    """Reconstruct the crowns and a strip of gum from a few wide photographs with known cameras.
+
+    Args:
+        images: [H, W, 3] float32 sRGB in 0..1; sizes may differ.
+        valid: [H, W] bool per image: where it may be used.
+        dentitions: what each photograph shows; None is skipped.
+        fit: cameras, labels and the arch's shape.
+        options: settings.
+        threads: number of threads; does not change the result.
+        progress: called with (step, done, total).
+
+    Raises:
+        ValueError: lists of different length, sizes that don't agree, or no placed photograph.
+    """
+    options = options or SurfaceOptions()
+    if not len(images) == len(valid) == len(dentitions) == len(fit.views):
+        raise ValueError(
+            f"dense_surface needs one image, mask, dentition and camera per photograph, not "
+            f"{len(images)}, {len(valid)}, {len(dentitions)} and {len(fit.views)}"
+        )
+    before = numba.get_num_threads()
+    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    numba.set_num_threads(max(1, min(threads, available)))
+    try:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return _dense_surface(images, valid, dentitions, fit, options, threads, progress)
+    finally:
+        numba.set_num_threads(before)
+
+
+def _dense_surface(
+    images: list[Array32],
+    valid: list[Mask],
+    dentitions: list[Dentition | None],
+    fit: ArchFit,
+    options: SurfaceOptions,
+    threads: int,
+    progress: Progress,
+) -> ArchSurface:
+    steps = 3 + len(options.rounds)
+    progress("photographs", 0, steps)
+    if not fit.shape:
+        raise ValueError("the arch has no landmarks, so that there is no surface to make")
+    middle = np.mean([fit.shape[mark] for mark in sorted(fit.shape)], axis=0)
+    photos = _prepare(images, valid, dentitions, fit, middle, options, threads)
+    progress("crown shapes", 1, steps)
+    jaws: tuple[Jaw, ...] = ("upper", "lower")
+    charts = [chart for jaw in jaws if (chart := start_chart(jaw, fit, options))]
+    if not photos or not charts:
+        raise ValueError(
+            "no photograph was placed with a named tooth, so that there is no surface to make; see "
+            "the labelled overlay of the crowns and pass --set init.dental.order or FDI hints"
+        )
+    pairs = choose_pairs(photos, middle, options)
+    for number, settings in enumerate(options.rounds if pairs else ()):
+        progress("sweep", 2 + number, steps)
+        nearest = nearest_depths(charts, photos, options.gum_height, threads)
+        seen = [comparable(chart, photos, nearest, options) for chart in charts]
+        for chart, shown in zip(charts, seen, strict=True):
+            trust = chart.gum_fades(options.gum_trust)
+            found = sweep(chart.grid, chart.radius, photos, shown, pairs, trust, settings, options)
+            chart.radius, chart.agreement = found.radius, found.weight
+    progress("colour", steps - 1, steps)
+    for chart in charts:
+        sigma = _AGREEMENT_SMOOTHING * chart.grid.density
+        smooth = cv2.GaussianBlur(chart.agreement, (0, 0), sigma)
+        chart.agreement = np.asarray(smooth, np.float32)
+    views: list[SurfaceView | None] = [None] * len(images)
+    looks = in_threads(lambda photo: _look(photo, charts, options), photos, threads)
+    gains = np.ones((len(images), 3))
+    cloud = coloured_cloud(charts, photos, _anchor(photos, fit), options, threads)
+    for photo, view, gain in zip(photos, looks, cloud.gains, strict=True):
+        views[photo.index], gains[photo.index] = view, gain
+    progress("colour", steps, steps)
+    return ArchSurface(
+        views=tuple(views),
+        positions=cloud.positions,
+        colors=cloud.colors,
+        normals=cloud.normals,
+        confidence=cloud.confidence,
+        tooth=cloud.tooth,
+        faces=cloud.faces,
+        gains=gains,
+    )
+
+
+def _anchor(photos: list[Photo], fit: ArchFit) -> int:
+    """The photograph whose exposure the others are brought to: the frontal one, if there is one."""
+    roles = [view.role if view else "" for view in (fit.views[photo.index] for photo in photos)]
+    return roles.index("frontal") if "frontal" in roles else len(roles) // 2
+
+
+def _prepare(
+    images: list[Array32],
+    valid: list[Mask],
+    dentitions: list[Dentition | None],
+    fit: ArchFit,
+    middle: Array64,
+    options: SurfaceOptions,
+    threads: int,
+) -> list[Photo]:
+    placed = [
+        (k, dentition, view)
+        for k, (dentition, view) in enumerate(zip(dentitions, fit.views, strict=True))
+        if dentition is not None and view is not None
+    ]
+    return in_threads(
+        lambda item: prepare_photo(
+            item[0], images[item[0]], valid[item[0]], item[1], item[2], middle,
+            options.gum_deviations,
+        ),
+        placed,
+        threads,
+    )  # fmt: skip
+
+
+def _look(photo: Photo, charts: list[Chart], options: SurfaceOptions) -> SurfaceView:
+    """The surface as a photograph sees it: tooth where it shows tooth, gum where it shows gum."""
+    depth = np.zeros(photo.size, np.float32)
+    normal = np.zeros((*photo.size, 3), np.float32)
+    agreement = np.zeros(photo.size, np.float32)
+    own: dict[Jaw, Mask] = {
+        "upper": (photo.upper > 0) | (photo.upper_gum > 0),
+        "lower": (photo.lower > 0) | (photo.lower_gum > 0),
+    }
+    tissue = own["upper"] | own["lower"]
+    certain = np.zeros(photo.size, bool)
+    for chart in charts:
+        z, place = raster_chart(photo, chart.points, chart.used(PAST_EDGE, options.gum_height))
+        mine = own[chart.shape.jaw]
+        # The photograph itself says which jaw it shows; without a chart of that jaw, the other's.
+        better = (z > 0) & tissue & ((depth == 0) | (z < depth)) & ~certain
+        better |= (z > 0) & mine
+        certain |= (z > 0) & mine
+        normals = smooth_normals(chart.radius, chart.grid)
+        x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+        turned = np.asarray(cv2.remap(normals, x, y, cv2.INTER_LINEAR), np.float32)
+        turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
+        agreed = np.asarray(cv2.remap(chart.agreement, x, y, cv2.INTER_LINEAR))
+        depth = np.where(better, z, depth)
+        normal = np.where(better[..., None], turned, normal)
+        agreement = np.where(better, agreed, agreement)
+    confidence = np.where(depth > 0, confidence_of(agreement), 1).astype(np.float32)
+    return SurfaceView(depth, normal.astype(np.float32), confidence)

@@ -1,0 +1,173 @@
+"""The charts of both jaws while they are worked on, and which photographs show what of them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.anatomy import Jaw, is_upper, teeth_of
+from stages.init.dental.chart import ChartGrid, grid_around, normals_of
+from stages.init.dental.crown_shape import (
+    JawShape,
+    beyond_crowns,
+    crown_points,
+    crown_radius,
+    jaw_shape,
+)
+from stages.init.dental.solution import ArchFit
+from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface_photo import Photo
+from stages.init.dental.surface_raster import nearest_of, raster_chart, sees
+from stages.init.parallel import in_threads
+
+Array32 = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+#: The charts go on this far beyond the biting edges (mm): photographs may show their far side.
+PAST_EDGE = 1.5
+#: For hiding, less far: beyond its edge the surface is invented.
+SOLID_PAST_EDGE = 0.3
+#: A sample this far (mm) behind the nearest surface is hidden: more than rounding and the noise of
+#: the surface, less than a tooth. Twice that while the surface is still being found.
+HIDDEN = 0.8
+#: Confidence is 1 + exp(low + (high - low) * agreement), as the dense stereo gives it: low for a
+#: guess, high for a good match.
+_CONFIDENCE = (-1.6, 2.0)
+#: Smoothing of the normals that are given out, and of those that decide what faces a view (mm).
+_NORMAL_SMOOTHING, _FACING_SMOOTHING = 0.15, 1.5
+#: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
+#: move with the camera.
+_GUM_FADES = (0.5, 2.0)
+#: Tissue is looked for this far around its outline (mm), for the cameras' errors.
+_OUTLINE_ERROR = 0.5
+
+
+@dataclass
+class Chart:
+    """The chart of one jaw.
+
+    Attributes:
+        shape: the teeth it shows.
+        grid: where its samples lie.
+        radius: [H, W] float32 distance from the axis, mm.
+        agreement: [H, W] float32 0..1: how well the photographs agree there.
+    """
+
+    shape: JawShape
+    grid: ChartGrid
+    radius: Array32
+    agreement: Array32
+
+    @property
+    def points(self) -> Array32:
+        """[H, W, 3] float32 positions, mm."""
+        return self.grid.points(self.radius)
+
+    def used(self, past_edge: float, past_gum: float) -> Mask:
+        """[H, W] bool: no more than so many mm beyond the biting edges and the gum line."""
+        gum, edge = beyond_crowns(self.grid, self.shape)
+        return (gum < past_gum) & (edge < past_edge)
+
+    def gum_fades(self, trust: float) -> Array32:
+        """[H, W] float32: 1 on the crowns and beside them, `trust` on the gum further up."""
+        gum, _ = beyond_crowns(self.grid, self.shape)
+        share = np.clip((gum - _GUM_FADES[0]) / (_GUM_FADES[1] - _GUM_FADES[0]), 0, 1)
+        return (1 - (1 - trust) * share).astype(np.float32)
+
+
+def smooth_normals(
+    radius: Array32, grid: ChartGrid, smoothing: float = _NORMAL_SMOOTHING
+) -> Array32:
+    """[H, W, 3] float32 unit normals of a chart's surface, smoothed over some mm."""
+    smooth = cv2.GaussianBlur(radius, (0, 0), smoothing * grid.density)
+    return normals_of(grid.points(np.asarray(smooth, np.float32)))
+
+
+def confidence_of(agreement: Array32) -> Array32:
+    """Confidence > 1 as pointmap models give it, of an agreement in 0..1."""
+    low, high = _CONFIDENCE
+    return (1 + np.exp(low + (high - low) * np.clip(agreement, 0, 1))).astype(np.float32)
+
+
+def teeth_present(fit: ArchFit) -> tuple[set[int], set[int]]:
+    """Teeth that some photograph shows, and teeth that are missing between shown neighbours."""
+    seen: set[int] = set()
+    skipped: set[int] = set()
+    jaws: tuple[Jaw, ...] = ("upper", "lower")
+    for view, jaw in itertools.product(fit.views, jaws):
+        if view is None:
+            continue
+        order, teeth = teeth_of(jaw), view.teeth(jaw)
+        seen |= {tooth for tooth in teeth if tooth}
+        for first, second in itertools.pairwise(teeth):
+            if first and second:
+                skipped |= set(order[order.index(first) + 1 : order.index(second)])
+    return seen, skipped - seen
+
+
+def start_chart(jaw: Jaw, fit: ArchFit, options: SurfaceOptions) -> Chart | None:
+    """The chart of a jaw as the crown shapes have it; None if no photograph shows its teeth."""
+    seen, missing = teeth_present(fit)
+    seen = {tooth for tooth in seen if is_upper(tooth) == (jaw == "upper")}
+    shape = jaw_shape(jaw, fit.shape, seen, missing)
+    if shape is None:
+        return None
+    points = crown_points(shape, options.crown_bulge, options.crown_flatness)
+    up = shape.gumwards
+    heights = np.array([point[1] for _, point in sorted(shape.landmarks.items())]) * up
+    ends = (heights.min() - PAST_EDGE) * up, (heights.max() + options.gum_height) * up
+    around = points.copy()
+    around[:, 1] = np.clip(around[:, 1], min(ends), max(ends))
+    grid = grid_around(around, 1.0, options.chart_density)
+    radius = crown_radius(grid, points, options.crown_smoothing)
+    return Chart(shape, grid, radius, np.zeros(grid.shape, np.float32))
+
+
+def nearest_depths(
+    charts: list[Chart], photos: list[Photo], gum: float, threads: int
+) -> list[Array32]:
+    """Per photograph the z-depth [h, w] of the nearest chart: what hides what."""
+    meshes = [(chart.points, chart.used(SOLID_PAST_EDGE, gum)) for chart in charts]
+
+    def nearest(photo: Photo) -> Array32:
+        return nearest_of([raster_chart(photo, points, used)[0] for points, used in meshes])
+
+    return in_threads(nearest, photos, threads)
+
+
+def facing(photo: Photo, points: Array32, normals: Array32) -> Array32:
+    """[H, W] float32 cosine between normals and the lines of sight."""
+    line = photo.centre.astype(np.float32) - points
+    length = np.linalg.norm(line, axis=-1)
+    return np.asarray((line * normals).sum(-1) / np.maximum(length, 1e-6), np.float32)
+
+
+def comparable(
+    chart: Chart,
+    photos: list[Photo],
+    nearest: list[Array32],
+    options: SurfaceOptions,
+) -> npt.NDArray[np.bool_]:
+    """[V, H, W] bool: samples of a chart that a photograph shows well enough to compare."""
+    points = chart.points
+    normals = smooth_normals(chart.radius, chart.grid, _FACING_SMOOTHING)
+    used = chart.used(PAST_EDGE, options.gum_height)
+    masks = []
+    for photo, front in zip(photos, nearest, strict=True):
+        tissue = _near_tissue(photo, chart.shape.jaw)
+        shown = photo.sample(tissue, photo.project(points)[0]) > 0.5
+        faces = facing(photo, points, normals) > options.least_facing
+        masks.append(used & shown & faces & sees(photo, front, points, 2 * HIDDEN))
+    return np.stack(masks)
+
+
+def _near_tissue(photo: Photo, jaw: Jaw) -> Array32:
+    """[h, w] float32: this jaw's teeth and gum and what is next to them."""
+    tissue = np.maximum(photo.tooth_of(jaw), photo.gum_of(jaw))
+    size = max(int(_OUTLINE_ERROR * photo.density), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    return np.asarray(cv2.dilate(tissue, disc), np.float32)

@@ -1,0 +1,182 @@
+"""One coloured cloud, and a mesh, from the charts of both jaws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.chart import ChartGrid, faces_of
+from stages.init.dental.crown_shape import beyond_crowns, within_crowns
+from stages.init.dental.surface_charts import (
+    HIDDEN,
+    PAST_EDGE,
+    Chart,
+    confidence_of,
+    facing,
+    nearest_depths,
+    smooth_normals,
+)
+from stages.init.dental.surface_colour import (
+    Showing,
+    blend,
+    even_rim,
+    find_gains,
+    find_tissue,
+    hidden_edges,
+    photo_weights,
+    show,
+    spread_colour,
+)
+from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface_photo import Photo
+from stages.init.dental.surface_raster import raster_chart, sees
+from stages.init.parallel import in_threads
+
+Array32 = npt.NDArray[np.float32]
+Array64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+#: A jaw covers what lies this far (mm) behind it.
+_COVERED = 0.3
+#: Cosine from which a sample is said to face a photograph.
+_FACES = 0.15
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """See `ArchSurface`; gains [V, 3] are those of the photographs used."""
+
+    positions: Array32
+    colors: Array32
+    normals: Array32
+    confidence: Array32
+    tooth: Mask
+    faces: npt.NDArray[np.int32]
+    gains: Array64
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A chart at the cloud's density, with what the photographs show of it."""
+
+    chart: Chart
+    grid: ChartGrid
+    points: Array32
+    normals: Array32
+    kept: Mask
+    tooth: Array32
+    showings: list[Showing]
+    weights: list[Array32]
+
+
+def coloured_cloud(
+    charts: list[Chart],
+    photos: list[Photo],
+    anchor: int,
+    options: SurfaceOptions,
+    threads: int,
+) -> Cloud:
+    """Cut the charts to tooth and gum and take their colour from the photographs.
+
+    Args:
+        charts: of the jaws.
+        photos: the photographs.
+        anchor: the photograph whose exposure the others are brought to.
+        options: settings.
+        threads: number of threads.
+    """
+    nearest = nearest_depths(charts, photos, options.gum_height, threads)
+    layers = [_layer(chart, photos, nearest, options, threads) for chart in charts]
+    gains = find_gains(
+        [[showing.colour for showing in layer.showings] for layer in layers],
+        [layer.weights for layer in layers],
+        anchor,
+    )
+    parts: list[tuple[npt.NDArray[np.generic], ...]] = []
+    start = 0
+    for layer in layers:
+        colours = [showing.colour for showing in layer.showings]
+        colour, total = blend(colours, layer.weights, gains)
+        shown = layer.kept & (total > 0)
+        behind = _behind_other_jaw(layer, charts, photos, threads)
+        crowns = behind & within_crowns(layer.grid, layer.chart.shape)
+        seen_tooth = shown & (layer.tooth > 0.5)
+        hidden = hidden_edges(seen_tooth, crowns, layer.grid.density, options.hidden_edge) & ~shown
+        colour = spread_colour(colour, shown)
+        kept = shown | hidden
+        agreement = layer.chart.grid.resample(layer.chart.agreement, layer.grid)
+        agreement = np.where(hidden, 0, agreement).astype(np.float32)
+        number = np.cumsum(kept.ravel()) - 1 + start
+        start += int(kept.sum())
+        parts.append(
+            (
+                layer.points[kept],
+                colour[kept],
+                layer.normals[kept],
+                confidence_of(agreement[kept]),
+                (seen_tooth | hidden)[kept],
+                number[faces_of(kept)].astype(np.int32),
+            )
+        )
+    joined = [np.concatenate([part[k] for part in parts]) for k in range(6)]
+    return Cloud(
+        positions=joined[0].astype(np.float32),
+        colors=joined[1].astype(np.float32),
+        normals=joined[2].astype(np.float32),
+        confidence=joined[3].astype(np.float32),
+        tooth=joined[4].astype(bool),
+        faces=joined[5].astype(np.int32),
+        gains=gains,
+    )
+
+
+def _layer(
+    chart: Chart,
+    photos: list[Photo],
+    nearest: list[Array32],
+    options: SurfaceOptions,
+    threads: int,
+) -> _Layer:
+    grid = chart.grid.resized(1 / options.cloud_spacing)
+    radius = chart.grid.resample(chart.radius, grid)
+    points, normals = grid.points(radius), smooth_normals(radius, grid)
+    jaw = chart.shape.jaw
+
+    def look(pair: tuple[Photo, Array32]) -> Showing:
+        photo, front = pair
+        seen = sees(photo, front, points, HIDDEN)
+        return show(photo, jaw, points, seen, facing(photo, points, normals))
+
+    showings = in_threads(look, zip(photos, nearest, strict=True), threads)
+    gum, edge = beyond_crowns(grid, chart.shape)
+    allowed = (gum < options.gum_height) & (edge < PAST_EDGE)
+    kept, tooth = find_tissue(
+        showings, grid.density, options.rim_smoothing, options.least_facing / 2
+    )
+    kept = even_rim(kept & allowed, tooth > 0.5, gum, grid.density)
+    weights = photo_weights(showings, kept, grid.density, options.colour_power)
+    return _Layer(chart, grid, points, normals, kept, tooth, showings, weights)
+
+
+def _behind_other_jaw(
+    layer: _Layer, charts: list[Chart], photos: list[Photo], threads: int
+) -> Mask:
+    """[H, W] bool: samples that face some photograph, but are always behind the other jaw."""
+    others = [(c.points, c.used(PAST_EDGE, 0)) for c in charts if c is not layer.chart]
+
+    def covered(photo: Photo) -> tuple[Mask, Mask]:
+        nothing = np.zeros(photo.size, np.float32)
+        inside = sees(photo, nothing, layer.points, 0)
+        inside &= facing(photo, layer.points, layer.normals) > _FACES
+        hidden = np.zeros(inside.shape, bool)
+        for points, used in others:
+            front = raster_chart(photo, points, used)[0]
+            hidden |= inside & ~sees(photo, front, layer.points, _COVERED)
+        return inside, hidden
+
+    found = in_threads(covered, photos, threads)
+    faced = np.any([inside for inside, _ in found], axis=0)
+    seen = np.any([inside & ~hidden for inside, hidden in found], axis=0)
+    return np.asarray(faced & ~seen)

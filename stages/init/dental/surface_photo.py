@@ -1,0 +1,253 @@
+"""What the surface needs of one placed photograph: camera, texture, and where tooth and gum are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dense.appearance import highlights
+from stages.init.dental.anatomy import Jaw
+from stages.init.dental.observation import Dentition
+from stages.init.dental.solution import PlacedView
+
+Array32 = npt.NDArray[np.float32]
+Array64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+#: Texture that correlates on enamel and gum alike: light, and not red (.6 L - .8 a of CIE Lab).
+_LIGHT, _RED = 0.6, -0.8
+#: The texture is normalised over this length (mm): about the correlation window, narrower than
+#: a crown, so that a highlight or the shade of the cheek does not decide.
+_NORMALISE = 1.2
+#: Contrast below this (8-bit Lab units) is noise.
+_NOISE = 4.0
+#: Gum is learnt in a ring beside the crowns (mm) on the gums' side.
+_RING = (0.4, 2.2)
+#: Least standard deviations of the gum's colour (8-bit L, a, b).
+_GUM_SPREAD = (14.0, 4.0, 4.5)
+#: Lighter and less red than the gum by more than so many standard deviations: not gum.
+_PALE = 1.8
+#: Holes in tooth and gum up to this size (square mm) that are not dark are wet highlights, or
+#: crowns of another colour.
+_WET = 30.0
+#: Not dark: lighter than so much of the gum.
+_LIT = 0.6
+#: Share of that size up to which a hole is a speck, bright or not.
+_SPECK = 0.02
+#: Gum in shade: that much darker (8-bit L) is no reason to call it something else.
+_GUM_SHADE = 25.0
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One placed photograph, prepared.
+
+    Attributes:
+        index: its place among the photographs given.
+        camera: [15] float64: cam_from_world rotation row by row, translation, focal,
+            principal point.
+        size: height, width.
+        density: pixels per mm at the teeth.
+        image: [H, W, 3] float32 sRGB 0..1.
+        texture: [H, W] float32, locally normalised.
+        upper, lower: [H, W] float32 0 or 1: tooth of this jaw.
+        upper_gum, lower_gum: [H, W] float32 0 or 1: gum of this jaw.
+        dull: [H, W] float32: 1, and 0 in highlights.
+        valid: [H, W] bool.
+    """
+
+    index: int
+    camera: Array64
+    size: tuple[int, int]
+    density: float
+    image: Array32
+    texture: Array32
+    upper: Array32
+    lower: Array32
+    upper_gum: Array32
+    lower_gum: Array32
+    dull: Array32
+    valid: Mask
+
+    def tooth_of(self, jaw: Jaw) -> Array32:
+        """[H, W] float32 0 or 1: teeth of this jaw."""
+        return self.upper if jaw == "upper" else self.lower
+
+    def gum_of(self, jaw: Jaw) -> Array32:
+        """[H, W] float32 0 or 1: gum of this jaw."""
+        return self.upper_gum if jaw == "upper" else self.lower_gum
+
+    @property
+    def centre(self) -> Array64:
+        """[3] position of the camera, mm."""
+        return -self.camera[:9].reshape(3, 3).T @ self.camera[9:12]
+
+    def project(self, points: Array32) -> tuple[Array32, Array32]:
+        """Pixel coordinates [..., 2] (centres at .5) and z-depths [...] of points [..., 3]."""
+        rotation = self.camera[:9].reshape(3, 3).astype(np.float32)
+        local = points @ rotation.T + self.camera[9:12].astype(np.float32)
+        depth = local[..., 2]
+        scale = np.float32(self.camera[12]) / np.maximum(depth, np.float32(1e-3))
+        pixels = local[..., :2] * scale[..., None] + self.camera[13:15].astype(np.float32)
+        return pixels, depth
+
+    def sample(self, values: Array32, pixels: Array32) -> Array32:
+        """Values [H, W(, C)] float32 at pixel coordinates [..., 2]; 0 outside the photograph."""
+        flat = pixels.reshape(-1, 2) if pixels.ndim != 3 else pixels
+        if flat.ndim == 2:
+            flat = flat[None]
+        sampled = cv2.remap(
+            values, flat[..., 0] - np.float32(0.5), flat[..., 1] - np.float32(0.5), cv2.INTER_LINEAR
+        )
+        return np.asarray(sampled, np.float32).reshape(pixels.shape[:-1] + values.shape[2:])
+
+
+def prepare_photo(
+    index: int,
+    image: Array32,
+    valid: Mask,
+    dentition: Dentition,
+    placed: PlacedView,
+    middle: Array64,
+    gum_deviations: float,
+) -> Photo:
+    """Prepare one photograph.
+
+    Args:
+        index: its place among the photographs.
+        image: [H, W, 3] float32 sRGB 0..1.
+        valid: [H, W] bool.
+        dentition: its teeth.
+        placed: its camera.
+        middle: [3] a point amid the teeth, mm.
+        gum_deviations: see `SurfaceOptions`.
+
+    Raises:
+        ValueError: arrays of different size.
+    """
+    height, width = image.shape[:2]
+    for what, mask in (
+        ("valid", valid),
+        ("tooth mask", dentition.mask),
+        ("above", dentition.above),
+    ):
+        if mask.shape != (height, width):
+            raise ValueError(
+                f"photograph {index}: the image is {width}x{height}, but '{what}' is "
+                f"{mask.shape[1]}x{mask.shape[0]}; they must be of the same working image"
+            )
+    pose = placed.cam_from_world
+    camera = np.array(
+        [*pose[:3, :3].ravel(), *pose[:3, 3], placed.focal, width / 2, height / 2], np.float64
+    )
+    density = placed.focal / max(float(pose[2, :3] @ middle + pose[2, 3]), 1.0)
+    lab = _lab(image)
+    tooth = dentition.mask & valid
+    gum = find_gum(lab, tooth, dentition, density, gum_deviations) & valid
+    shiny = highlights(image)
+    return Photo(
+        index=index,
+        camera=camera,
+        size=(height, width),
+        density=density,
+        image=np.ascontiguousarray(image, np.float32),
+        texture=_texture(lab, density),
+        upper=(tooth & dentition.above).astype(np.float32),
+        lower=(tooth & ~dentition.above).astype(np.float32),
+        upper_gum=(gum & dentition.above).astype(np.float32),
+        lower_gum=(gum & ~dentition.above).astype(np.float32),
+        dull=(1 - shiny).astype(np.float32),
+        valid=valid,
+    )
+
+
+def _lab(image: Array32) -> Array32:
+    """CIE Lab [H, W, 3] float32, each channel scaled as in 8-bit images (L 0..255)."""
+    lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(image, np.float32), cv2.COLOR_RGB2Lab))
+    return np.asarray(lab * np.array([2.55, 1, 1], np.float32), np.float32)
+
+
+def _texture(lab: Array32, density: float) -> Array32:
+    plain = _LIGHT * lab[..., 0] + _RED * lab[..., 1]
+    sigma = _NORMALISE * density
+    mean = cv2.GaussianBlur(plain, (0, 0), sigma)
+    spread = np.sqrt(cv2.GaussianBlur((plain - mean) ** 2, (0, 0), sigma)) + np.float32(_NOISE)
+    normal = np.clip((plain - mean) / spread, -3, 3).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(normal, (0, 0), max(0.07 * density, 0.4)), np.float32)
+
+
+def find_gum(
+    lab: Array32, tooth: Mask, dentition: Dentition, density: float, deviations: float
+) -> Mask:
+    """Gum around the teeth, told from gloves, lips, retractors and the dark by its colour.
+
+    The ring just beyond the crowns is gum nearly everywhere: its median colour and spread are those
+    of this patient's gum in this light.
+
+    Args:
+        lab: [H, W, 3] float32, 8-bit scaling.
+        tooth: [H, W] bool.
+        dentition: the teeth.
+        density: pixels per mm.
+        deviations: furthest colour, in standard deviations.
+
+    Returns:
+        [H, W] bool; all False where nothing red is beside the crowns.
+    """
+    distance = cv2.distanceTransform((~tooth).astype(np.uint8), cv2.DIST_L2, 5) / density
+    ring = (distance > _RING[0]) & (distance < _RING[1]) & _gumwards(tooth, dentition)
+    red = lab[..., 1] > (np.median(lab[tooth, 1]) if tooth.any() else 0) + 6
+    seed = lab[ring & red]
+    if len(seed) < 50:
+        return np.zeros(tooth.shape, bool)
+    middle = np.median(seed, axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(seed - middle), axis=0), _GUM_SPREAD)
+    smooth = np.asarray(cv2.GaussianBlur(lab, (0, 0), max(0.1 * density, 0.6)), np.float32)
+    away = (smooth - middle.astype(np.float32)) / spread.astype(np.float32)
+    away[..., 0] = np.where(
+        away[..., 0] < 0, np.minimum(away[..., 0] + _GUM_SHADE / spread[0], 0), away[..., 0]
+    )
+    # Gloves and lips under them are both lighter and less red than gum.
+    pale = (away[..., 0] - away[..., 1]) / np.float32(np.sqrt(2))
+    like = ((away**2).sum(-1) < deviations**2) & (pale < _PALE) & ~tooth
+    size = max(int(0.35 * density), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    # Small wet highlights on the gum are gum; thin red seams of a glove are not.
+    closed = cv2.morphologyEx((like | tooth).astype(np.uint8), cv2.MORPH_CLOSE, disc)
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc) > 0
+    tissue = _fill_bright_holes(
+        opened | tooth, smooth[..., 0] > _LIT * middle[0], _WET * density**2
+    )
+    count, label = cv2.connectedComponents(tissue.astype(np.uint8), connectivity=4)
+    touching = np.zeros(count, bool)
+    touching[np.unique(label[tooth])] = True
+    touching[0] = False
+    return touching[label] & ~tooth
+
+
+def _fill_bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:
+    """Fill holes of at most `most` pixels, most of which are bright."""
+    count, label = cv2.connectedComponents((~tissue).astype(np.uint8), connectivity=4)
+    area = np.bincount(label.ravel(), minlength=count)
+    lit = np.bincount(label[bright], minlength=count)
+    hole = ((area <= most) & (lit > 0.7 * area)) | (area <= most * _SPECK)
+    hole[0] = False
+    return tissue | hole[label]
+
+
+def _gumwards(tooth: Mask, dentition: Dentition) -> Mask:
+    """[H, W] bool: beyond the row of teeth, not between the jaws."""
+    turn = np.array([np.sin(dentition.roll), np.cos(dentition.roll)])
+    y, x = np.mgrid[: tooth.shape[0], : tooth.shape[1]]
+    across = y * turn[1] - x * turn[0]
+    along = np.rint(x * turn[1] + y * turn[0]).astype(np.int64)
+    along -= along.min()
+    size = int(along.max()) + 1
+    highest = np.full(size, np.inf)
+    lowest = np.full(size, -np.inf)
+    np.minimum.at(highest, along[tooth], across[tooth])
+    np.maximum.at(lowest, along[tooth], across[tooth])
+    return (across < highest[along]) | (across > lowest[along])

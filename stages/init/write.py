@@ -1,0 +1,133 @@
+"""Writing what the stage found: dense points, pointmaps, cameras with their scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
+from pipeline.artifacts.points import Points
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import RequestError
+from pipeline.stage import StageContext
+from stages.init import cloud
+from stages.init.config import InitConfig
+from stages.init.dense import DenseOptions, dense_depths
+from stages.init.geometry import spanning_tree
+from stages.init.scale import mm_per_unit, photo_named
+
+if TYPE_CHECKING:
+    from stages.init.placement import Placement
+
+Map = npt.NDArray[np.float32]
+
+
+def densify(context: StageContext, views: Views, placement: Placement) -> None:
+    """Dense stereo from the cameras found, and everything written."""
+    config: InitConfig = context.config
+    cameras, points = placement.cameras, placement.points
+    images = [view.image for view in placement.views]
+    dense = dense_depths(
+        images,
+        [view.valid() for view in placement.views],
+        list(cameras),
+        [points[seen].astype(np.float32) for seen in placement.seen],
+        DenseOptions(**config.dense.model_dump()),
+        context.threads,
+        lambda done, total: context.progress("dense stereo", done, total),
+    )
+    clouds = [
+        cloud.depth_points(image, found.depth, found.normal, found.confidence, camera)
+        for image, found, camera in zip(images, dense, cameras, strict=True)
+    ]
+    dense_count = sum(len(found) for found in clouds)
+    if dense_count < config.min_dense_points:
+        context.warn(
+            f"Dense stereo found only {dense_count} points; the {len(points)} points of the sparse "
+            "reconstruction are added. The surface will have holes."
+        )
+        clouds.append(cloud.sparse_points(points, images, list(cameras)))
+    if config.fill_step:
+        for image, found, camera in zip(images, dense, cameras, strict=True):
+            rest = np.where(found.depth > 0, np.float32(0), found.filled)
+            clouds.append(
+                cloud.depth_points(
+                    image, rest, found.normal, found.confidence, camera, config.fill_step
+                )
+            )
+    result = cloud.thinned(cloud.joined(clouds), config.max_points, context.seed)
+    depths = [np.where(found.depth > 0, found.depth, found.filled) for found in dense]
+    tree = spanning_tree(placement.weights, len(cameras))
+    pairs = [
+        cloud.pointmap_pair(
+            cameras[i], cameras[j], depths[i], depths[j], dense[i].confidence, dense[j].confidence
+        )
+        for i, j in cloud.pointmap_edges(placement.weights, tree, len(cameras))
+    ]
+    save_all(
+        context, views, placement.views,
+        Cameras(cameras, placement.input_from_world, placement.units), depths, result, pairs,
+    )  # fmt: skip
+    context.summarize(sparse_points=len(points), dense_points=dense_count, **placement.figures)
+
+
+def save_all(
+    context: StageContext, views: Views, placed: tuple[View, ...], cameras: Cameras,
+    depths: list[Map], points: Points, pairs: list[PointmapPair],
+) -> None:  # fmt: skip
+    """Write the outputs, with the scale that is known.
+
+    Args:
+        views: all that the stage was given.
+        placed: the views of the cameras; written too where their images or masks have changed.
+        depths: z-depth [H, W] of each, to measure in.
+    """
+    config: InitConfig = context.config
+    if config.length.mm is not None:
+        cameras = _scaled(context, views, placed, cameras, depths)
+    context.save(cameras)
+    context.save(points)
+    context.save(Pointmaps(pairs))
+    before = views.by_name()
+    changed = {view.name: view for view in placed if _differs(view, before[view.name])}
+    if changed:
+        context.save(replace(views, views=tuple(changed.get(v.name, v) for v in views.views)))
+    bent = sum(view.image is not before[view.name].image for view in placed)
+    if bent:
+        context.summarize(undistorted=bent)
+    focals = [camera.fx / max(camera.width, camera.height) for camera in cameras.cameras]
+    context.summarize(
+        views_registered=len(cameras), views_total=len(views),
+        focal=round(float(np.median(focals)), 4), points=len(points),
+    )  # fmt: skip
+
+
+def _differs(view: View, before: View) -> bool:
+    same = view.image is before.image and view.mask is before.mask
+    return not same or view.focal_px != before.focal_px
+
+
+def _scaled(
+    context: StageContext, views: Views, placed: tuple[View, ...], cameras: Cameras,
+    depths: list[Map],
+) -> Cameras:  # fmt: skip
+    """The cameras with the way to millimetres that the known length gives."""
+    length = context.config.length
+    assert length.mm is not None
+    view = photo_named(views, length.photo)
+    number = next((k for k, other in enumerate(placed) if other.name == view.name), None)
+    if number is None:
+        raise RequestError(
+            f"init.length.photo: {length.photo} could not be placed, so that nothing can be "
+            "measured in it. Name another photograph."
+        )
+    camera: Camera = cameras.cameras[number]
+    factor = mm_per_unit(view, camera, depths[number], length.start, length.end, length.mm)
+    scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
+    input_from_world = np.diag([factor / scale] * 3 + [1.0]) @ cameras.input_from_world
+    context.summarize(mm_per_unit=round(factor, 4))
+    return replace(cameras, input_from_world=input_from_world, units="mm")
