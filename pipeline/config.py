@@ -6,6 +6,7 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -116,7 +117,7 @@ def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         chain = " -> ".join(entry.name for entry in (*seen, path))
         raise RequestError(f"The presets extend each other in a circle: {chain}.")
     try:
-        tree = yaml.safe_load(path.read_text())
+        tree = _yaml(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise RequestError(f"The preset {path} can't be read: {error}") from error
     if not isinstance(tree, dict):
@@ -142,6 +143,23 @@ def _find_preset(preset: str | Path, seen: tuple[Path, ...]) -> Path:
     )
 
 
+class _YamlLoader(yaml.SafeLoader):
+    """YAML 1.2 booleans: ``on`` and ``off`` are words (several settings have them as values)."""
+
+
+_YamlLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in rules if tag != "tag:yaml.org,2002:bool"]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_YamlLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
+
+
+def _yaml(text: str) -> Any:
+    return yaml.load(text, _YamlLoader)  # a SafeLoader
+
+
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
@@ -157,7 +175,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
             f"--set takes stage.key=value, as in --set sap.quantile=0.99; this is '{text}'."
         )
     try:
-        return key.strip(), yaml.safe_load(value)
+        return key.strip(), _yaml(value)
     except yaml.YAMLError as error:
         raise RequestError(f"The value of --set {text} can't be read: {error}") from error
 

@@ -30,6 +30,9 @@ class View:
         source_sha256: of the source file's bytes.
         focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
         timestamp: seconds from the start of the video, or None.
+        lens_taken_out: where the image has been undistorted, the lens that it had before, as a line
+            of COLMAP's ``cameras.txt`` without number (model, width, height, parameters);
+            `working_from_source` then leads to pixels of the image before.
     """
 
     name: str
@@ -41,6 +44,7 @@ class View:
     source_sha256: str = ""
     focal_px: float | None = None
     timestamp: float | None = None
+    lens_taken_out: str = ""
 
     @property
     def width(self) -> int:
@@ -104,6 +108,7 @@ class Views(Artifact):
                     "source_size": list(view.source_size),
                     "focal_px": view.focal_px,
                     "timestamp": view.timestamp,
+                    "lens_taken_out": view.lens_taken_out,
                 }
             )
         text = json.dumps({"ordered": self.ordered, "views": entries}, indent=1)
@@ -128,6 +133,7 @@ class Views(Artifact):
                     source_sha256=entry["source_sha256"],
                     focal_px=entry["focal_px"],
                     timestamp=entry["timestamp"],
+                    lens_taken_out=entry.get("lens_taken_out", ""),
                 )
             )
         return cls(views=tuple(views), ordered=meta["ordered"])

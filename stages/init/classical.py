@@ -18,6 +18,7 @@ from stages.init.geometry import (
     TwoView,
     coherent_matches,
     homography_share,
+    unrolled,
 )
 from stages.init.mapping import MappingInput, Solution
 from stages.init.matching import candidate_pairs, match_features, overlap_counts, select_pairs
@@ -26,10 +27,15 @@ from stages.init.options import (
     REFERENCE_SIDE,
     VIEWS_PER_FREE_LENS,
     ClassicalOptions,
+    RefinementOptions,
 )
 from stages.init.parallel import in_threads
+from stages.init.refine import refine_solution
+from stages.init.roll import find_rolls, groups
 from stages.init.solver import Progress, Solver, known_focal, unknown_focal
 
+#: Defaults of the last adjustment.
+REFINEMENT = RefinementOptions()
 #: How many pairs are asked whether there is any parallax.
 PAIRS_CHECKED_FOR_DEPTH = 4
 
@@ -43,6 +49,7 @@ class Evidence:
         matches: pair -> number of matches.
         displacement: pair -> median length in pixels by which its coherent matches move.
         edges: pair -> two-view geometry at the focal length used last.
+        linked: the pairs that can be believed.
         flat: least share of the inliers of a pair that one homography explains, of the pairs used
             that move most; 1: there is no depth to see.
     """
@@ -51,6 +58,7 @@ class Evidence:
     matches: dict[Pair, int]
     displacement: dict[Pair, float]
     edges: dict[Pair, TwoView] = field(default_factory=dict)
+    linked: tuple[Pair, ...] = ()
     flat: float = 0.0
 
 
@@ -83,6 +91,7 @@ def reconstruct(
     threads: int,
     scratch: Path,
     progress: Progress,
+    refinement: RefinementOptions = REFINEMENT,
 ) -> Attempt:
     """Find cameras and sparse points.
 
@@ -95,25 +104,37 @@ def reconstruct(
         threads: how many to use; doesn't change the result.
         scratch: folder for the mapper's files.
         progress: called with (step, done, total).
+        refinement: settings of the last adjustment.
     """
     side = max(max(gray.shape) for gray in grays)
     pixel = side / REFERENCE_SIDE
-    features = find_features(grays, valid, options, threads, progress)
-    correspondences = match_views(features, ordered, options, pixel, threads, progress)
     lenses, lens_of_view = group_lenses([gray.shape for gray in grays], focals)
-    given = MappingInput(
-        lenses=lenses,
-        lens_of_view=lens_of_view,
-        positions=[feature.positions for feature in features],
-        points=[feature.points for feature in features],
-        correspondences=correspondences,
-    )
+
+    def matched(rolls: list[float]) -> tuple[list[Features], Solver]:
+        features = find_features(grays, valid, options, threads, progress, rolls)
+        given = MappingInput(
+            lenses=lenses,
+            lens_of_view=lens_of_view,
+            positions=[feature.positions for feature in features],
+            points=[feature.points for feature in features],
+            correspondences=match_views(features, ordered, options, pixel, threads, progress),
+        )
+        return features, Solver(given, options, pixel, seed, threads, scratch)
+
+    features, solver = matched([0.0] * len(grays))
+    linked = solver.links()
+    if refinement.unroll and len(set(groups(linked, len(grays)))) > 1:
+        rolls = find_rolls(
+            grays, valid, linked, options.peak_threshold, pixel, threads, progress
+        )  # fmt: skip
+        if any(rolls):
+            features, solver = matched(rolls)
+    correspondences = solver.given.correspondences
     evidence = Evidence(
         keypoints=[len(np.unique(feature.points)) for feature in features],
         matches={pair: len(found) for pair, found in correspondences.items()},
         displacement={pair: _displacement(found) for pair, found in correspondences.items()},
     )
-    solver = Solver(given, options, pixel, seed, threads, scratch)
     free = options.refine_focal == "always" or (
         options.refine_focal == "auto"
         and not focal_given
@@ -126,6 +147,7 @@ def reconstruct(
         best, determined = unknown_focal(solver, free, progress)
     if best is not None:
         best = solver.with_other_mapper(best, free)
+        best = refine_solution(solver, best, free, refinement)
     progress("reconstruct", 1, 1)
     edges = solver.edges_used(best)
     used = [pair for pair in best.edges if pair in edges] if best else []
@@ -138,7 +160,12 @@ def reconstruct(
     ]
     return Attempt(
         solution=best,
-        evidence=replace(evidence, edges=edges, flat=min(shares, default=0.0)),
+        evidence=replace(
+            evidence,
+            edges=edges,
+            linked=tuple(solver.believed(edges)),
+            flat=min(shares, default=0.0),
+        ),
         focal_known=known,
         focal_determined=determined,
     )
@@ -173,13 +200,16 @@ def find_features(
     options: ClassicalOptions,
     threads: int,
     progress: Progress,
+    rolls: list[float] | None = None,
 ) -> list[Features]:
+    """The features of all views; `rolls` are their rolls in degrees, if any is known."""
+
     def detect(view: int) -> Features:
         return detect_features(
             grays[view], valid[view],
             squeezes=options.squeezes, upright=options.upright,
             peak_threshold=options.peak_threshold, max_features=options.max_features,
-            merge_radius=options.merge_radius,
+            merge_radius=options.merge_radius, roll=rolls[view] if rolls else 0.0,
         )  # fmt: skip
 
     return in_threads(
@@ -195,6 +225,7 @@ def match_views(
     threads: int,
     progress: Progress,
 ) -> dict[Pair, Correspondences]:
+    """The matches of all pairs of views that may overlap."""
     pairs = candidate_pairs(len(features), ordered, options.window)
     with threadpool_limits(1, "blas"):
         counts = overlap_counts(features, pairs, options.overlap_features)
@@ -213,8 +244,12 @@ def match_views(
         )  # fmt: skip
         positions_i = features[i].positions[found[:, 0]]
         positions_j = features[j].positions[found[:, 1]]
-        coherent = coherent_matches(positions_i, positions_j, COHERENCE_RADIUS * pixel)
-        return Correspondences(found, positions_i, positions_j, coherent)
+        rolls = features[i].roll, features[j].roll
+        coherent = coherent_matches(
+            unrolled(positions_i, rolls[0]), unrolled(positions_j, rolls[1]),
+            COHERENCE_RADIUS * pixel,
+        )  # fmt: skip
+        return Correspondences(found, positions_i, positions_j, coherent, *rolls)
 
     # OpenBLAS's own threads wait by spinning: under ours they took 2.6 times the CPU time.
     with threadpool_limits(1, "blas"):

@@ -11,11 +11,13 @@ from pipeline.stage import StageConfig, runtime
 from stages.init.dense.options import DenseOptions
 from stages.init.dental.arch_options import ArchOptions
 from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.options import RefinementOptions
 from stages.init.pointmap.options import PointmapOptions
 
 #: Defaults are said once, where they were measured.
 DENSE = DenseOptions()
 ARCH = ArchOptions()
+REFINEMENT = RefinementOptions()
 SURFACE = SurfaceOptions()
 POINTMAPS = PointmapOptions()
 
@@ -86,6 +88,27 @@ class DenseConfig(StageConfig):
     )
 
 
+class RefinementConfig(StageConfig):
+    """The last adjustment of cameras from features, and what is tried where it fails."""
+
+    loss_scale: float = Field(
+        REFINEMENT.loss_scale, gt=0, le=20, description="robust loss from this error on, px at 512"
+    )
+    refine_distortion: Literal["auto", "always", "never"] = Field(
+        "auto", description="estimate a radial coefficient per lens; auto: where it helps clearly"
+    )
+    distortion_views: int = Field(
+        REFINEMENT.distortion_views, ge=2, le=1000, description="views that a lens needs for it"
+    )
+    distortion_observations: int = Field(
+        REFINEMENT.distortion_observations, ge=20, description="observations it needs for it"
+    )
+    distortion_gain: float = Field(
+        REFINEMENT.distortion_gain, ge=0, lt=1, description="share by which the error must fall"
+    )
+    unroll: bool = Field(True, description="where links are missing, look for rolled photographs")
+
+
 class PointmapConfig(StageConfig):
     """Pointmaps of a learned model, or made elsewhere."""
 
@@ -149,7 +172,6 @@ class DentalConfig(StageConfig):
     tooth_widths: dict[int, Annotated[float, Field(gt=2, lt=20)]] = Field(
         {}, description="known mesiodistal widths in mm by FDI number, for the scale"
     )
-    missing: tuple[int, ...] = Field((), description="FDI numbers of teeth that are not there")
     focal_per_side: float = Field(
         ARCH.focal_per_side, ge=0.3, le=10, description="focal length expected over the long side"
     )
@@ -264,6 +286,9 @@ class InitConfig(StageConfig):
         2.0, gt=0, le=50, description="beyond it an observation is dropped, px at 512 px width"
     )
     min_tri_angle: float = Field(1.0, ge=0, le=45, description="least triangulation angle, degrees")
+    refinement: RefinementConfig = Field(
+        RefinementConfig.model_validate({}), description="the last adjustment; rolled photographs"
+    )
     max_points: int = Field(400_000, ge=1000, le=20_000_000, description="points kept at most")
     fill_step: int = Field(
         4, ge=0, le=64, description="every n-th pixel without stereo depth is filled in; 0: none"

@@ -9,6 +9,7 @@ import numpy as np
 from stages.init.classical import Attempt, Evidence
 from stages.init.geometry import Pair, angle_between
 from stages.init.mapping import Solution
+from stages.init.roll import groups
 
 #: Advice that helps in nearly all cases.
 HOW_TO_SHOOT = (
@@ -16,6 +17,23 @@ HOW_TO_SHOOT = (
     "20 degrees against each other, all sharp and with the same zoom, and move the camera rather "
     "than turning it on the spot."
 )
+
+
+HOW_TO_BRIDGE = (
+    "Add a photograph between them, turned no more than 20 degrees against either, sharp and with "
+    "the same zoom (or take a short video that sweeps around)."
+)
+HOW_TO_GIVE_FOCAL = (
+    "Keep the EXIF data of the photographs, or pass the focal length over the long side of the "
+    "image, if you know it, as in --set init.focal=1.2."
+)
+#: Photographs of teeth that are turned by no more than this against each other, in degrees, are
+#: linked; those from 40 on hardly ever (see `TwoView.evidence`).
+LINKED_UP_TO = 35
+#: A photograph with less than this share of the spots that the others show is a bad one.
+BLURRED = 0.4
+#: Gaps and photographs that are explained one by one.
+MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -71,17 +89,21 @@ def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
-            f"{_weakest_link(evidence, names, set())} {_advice(attempt)}"
+            f"{_gaps(evidence, names)} {_advice(attempt)}"
         )
     doubt = doubtful(solution, evidence, limits)
     if doubt:
         return f"{doubt} {HOW_TO_SHOOT}"
     if len(solution.poses) < limits.min_views:
-        unplaced = [names[view] for view in range(len(names)) if view not in solution.poses]
+        unplaced = [view for view in range(len(names)) if view not in solution.poses]
+        reasons = " ".join(
+            _why_unplaced(evidence, names, view, set(solution.poses))
+            for view in unplaced[:MOST_NAMED]
+        )
         return (
             f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
-            f"{limits.min_views} are needed. Not placed: {_listed(unplaced)}. "
-            f"{_weakest_link(evidence, names, set(solution.poses))} {_advice(attempt)}"
+            f"{limits.min_views} are needed. Not placed: "
+            f"{_listed([names[view] for view in unplaced])}. {reasons} {_advice(attempt)}"
         )
     return None
 
@@ -145,39 +167,101 @@ def _median_depth(solution: Solution) -> float:
     return float(np.median(np.concatenate(depths))) if depths else 0.0
 
 
-def _weakest_link(evidence: Evidence, names: list[str], placed: set[int]) -> str:
-    """Name the pair that should link the unplaced photographs with the rest, and what it lacks."""
-    missing = [pair for pair in evidence.matches if not placed or len({*pair} & placed) == 1]
-    if not missing:
-        return "They have no matches with the others at all."
+def warnings_of(attempt: Attempt, names: list[str]) -> list[str]:
+    """What the user should know of a reconstruction that stands: views left out, and a guess.
+
+    Args:
+        names: how the user knows the photographs.
+    """
+    solution = attempt.solution
+    if solution is None:
+        return []
+    unplaced = [view for view in range(len(names)) if view not in solution.poses]
+    result = []
+    if unplaced:
+        reasons = " ".join(_why_unplaced(attempt.evidence, names, view, set(solution.poses))
+                           for view in unplaced[:MOST_NAMED])  # fmt: skip
+        result.append(
+            f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
+            f"{_listed([names[view] for view in unplaced])}. {reasons} {HOW_TO_BRIDGE}"
+        )
+    if not attempt.focal_determined:
+        few = " Two photographs fit nearly any." if len(solution.poses) < 3 else ""
+        result.append(f"The focal length is undetermined: it is a guess.{few} {HOW_TO_GIVE_FOCAL}")
+    return result
+
+
+def _why_unplaced(evidence: Evidence, names: list[str], view: int, placed: set[int]) -> str:
+    """One sentence: why a photograph could not be placed beside those that are."""
+    usual = float(np.median(evidence.keypoints))
+    if evidence.keypoints[view] < BLURRED * usual:
+        return (
+            f"'{names[view]}' shows only {evidence.keypoints[view]} distinct spots where the "
+            f"others show {usual:.0f}: it is blurred, too dark, too bright or mostly masked."
+        )
+    pair = _best_pair(evidence, [pair for pair in evidence.matches
+                                 if view in pair and ({*pair} - {view}) & placed])  # fmt: skip
+    if pair is None:
+        return f"'{names[view]}' resembles none of the placed ones."
+    if pair in evidence.linked:
+        other = names[pair[0] if pair[1] == view else pair[1]]
+        agreeing = len(evidence.edges[pair].inliers)
+        return (
+            f"'{names[view]}' matches '{other}' ({agreeing} spots agree), but contradicts the "
+            "other photographs: something moved, or the zoom changed."
+        )
+    return _link(evidence, names, pair)
+
+
+def _gaps(evidence: Evidence, names: list[str]) -> str:
+    """A sentence on each gap that keeps photographs apart: the best of the pairs across it."""
+    group = groups(list(evidence.linked), len(names))
+    sentences: list[str] = []
+    while len(set(group)) > 1 and len(sentences) < MOST_NAMED:
+        across = [pair for pair in evidence.matches if group[pair[0]] != group[pair[1]]]
+        pair = _best_pair(evidence, across)
+        if pair is None:
+            lone = [names[view] for view in range(len(names)) if group[view] != group[0]]
+            sentences.append(f"{_listed(lone)} resemble none of the others.")
+            break
+        sentences.append(_link(evidence, names, pair))
+        old, new = group[pair[1]], group[pair[0]]
+        group = [new if number == old else number for number in group]
+    if sentences:
+        return " ".join(sentences)
+    return (
+        "All photographs are linked by matches, but these contradict each other: something moved "
+        "between them, or the zoom changed."
+    )
+
+
+def _best_pair(evidence: Evidence, pairs: list[Pair]) -> Pair | None:
+    """The pair that comes nearest to a link."""
 
     def strength(pair: Pair) -> tuple[float, int]:
         edge = evidence.edges.get(pair)
         return (edge.evidence if edge else 0.0, evidence.matches[pair])
 
-    pair = min(missing, key=lambda pair: (tuple(-value for value in strength(pair)), pair))
-    first, second = names[pair[0]], names[pair[1]]
+    return min(
+        pairs, key=lambda pair: (tuple(-value for value in strength(pair)), pair), default=None
+    )  # fmt: skip
+
+
+def _link(evidence: Evidence, names: list[str], pair: Pair) -> str:
+    """What a pair that does not link has, and how far apart it must be for that."""
     matches = evidence.matches[pair]
     edge = evidence.edges.get(pair)
     agreeing = len(edge.inliers) if edge else 0
     share = 100 * agreeing / max(matches, 1)
     return (
-        f"Even the most alike, '{first}' and '{second}', share too little: {matches} spots look "
-        f"alike, of which {agreeing} ({share:.0f} %) agree on where the camera stood."
+        f"'{names[pair[0]]}' and '{names[pair[1]]}' share too little: {matches} spots look alike, "
+        f"of which {agreeing} ({share:.0f} %) agree on where the camera stood. They are probably "
+        f"more than {LINKED_UP_TO} degrees apart."
     )
 
 
 def _advice(attempt: Attempt) -> str:
-    text = (
-        "Add a photograph between them, turned no more than 20 degrees against either, sharp and "
-        "with the same zoom (or take a short video that sweeps around)."
-    )
-    if not attempt.focal_known:
-        text += (
-            " Keep the EXIF data of the photographs, or give the focal length over the long side "
-            "of the image with --set init.focal=1.2, if you know it."
-        )
-    return text
+    return HOW_TO_BRIDGE if attempt.focal_known else f"{HOW_TO_BRIDGE} {HOW_TO_GIVE_FOCAL}"
 
 
 def _listed(names: list[str]) -> str:

@@ -29,6 +29,7 @@ class Features:
         squeezes: [K] float32, the horizontal squeeze of the copy on which it was found, 1 = none.
         points: [K] int64, for each the index of the keypoint that stands for its place: keypoints
             nearer than the merging radius share one.
+        roll: degrees, clockwise, that were taken out of the image before describing it.
     """
 
     positions: npt.NDArray[np.float64]
@@ -36,6 +37,7 @@ class Features:
     scales: npt.NDArray[np.float32]
     squeezes: npt.NDArray[np.float32]
     points: npt.NDArray[np.int64]
+    roll: float = 0.0
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -55,6 +57,7 @@ def detect_features(
     peak_threshold: float = 0.002,
     max_features: int = 6000,
     merge_radius: float = 1.2,
+    roll: float = 0.0,
 ) -> Features:
     """Detect and describe the keypoints of one view.
 
@@ -66,12 +69,17 @@ def detect_features(
         peak_threshold: contrast below which a keypoint is ignored.
         max_features: per copy, the largest are kept.
         merge_radius: pixels within which keypoints count as the same place.
+        roll: degrees by which the photograph is rolled clockwise; it is turned back first.
     """
     positions, descriptors, scales, levels = [], [], [], []
+    turned, original_from_turned = turned_back(gray, roll)
     for squeeze in squeezes:
-        copy = squeezed(gray, squeeze)
+        copy = squeezed(turned, squeeze)
         keypoints, described = _sift(copy, upright, peak_threshold, max_features)
-        place = keypoints[:, :2].astype(np.float64) * (gray.shape[1] / copy.shape[1], 1.0)
+        place = keypoints[:, :2].astype(np.float64) * (turned.shape[1] / copy.shape[1], 1.0)
+        place = place @ original_from_turned[:, :2].T + original_from_turned[:, 2]
+        within = ((place >= 0) & (place < gray.shape[::-1])).all(1)
+        keypoints, described, place = keypoints[within], described[within], place[within]
         column = np.clip(place[:, 0].astype(np.int64), 0, gray.shape[1] - 1)
         row = np.clip(place[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
         inside = valid[row, column]
@@ -86,7 +94,66 @@ def detect_features(
         scales=np.concatenate(scales),
         squeezes=np.concatenate(levels),
         points=merge_points(place, merge_radius),
+        roll=roll,
     )
+
+
+def oriented_features(
+    gray: npt.NDArray[np.uint8], valid: npt.NDArray[np.bool_], peak_threshold: float, count: int
+) -> tuple[Features, npt.NDArray[np.float64]]:
+    """Features that don't care how the photograph is rolled, and their orientations.
+
+    Args:
+        gray: [H, W] uint8.
+        valid: [H, W] bool; keypoints outside are dropped.
+        peak_threshold: contrast below which a keypoint is ignored.
+        count: the largest are kept.
+
+    Returns:
+        The features, and [K] radians from the x axis towards the y axis.
+    """
+    keypoints, described = _sift(gray, False, peak_threshold, count)
+    column = np.clip(keypoints[:, 0].astype(np.int64), 0, gray.shape[1] - 1)
+    row = np.clip(keypoints[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
+    inside = valid[row, column]
+    keypoints, described = keypoints[inside], described[inside]
+    features = Features(
+        positions=keypoints[:, :2].astype(np.float64),
+        descriptors=described,
+        scales=keypoints[:, 2],
+        squeezes=np.ones(len(keypoints), np.float32),
+        points=np.arange(len(keypoints)),
+    )
+    return features, keypoints[:, 3].astype(np.float64)
+
+
+def turned_back(
+    gray: npt.NDArray[np.uint8], roll: float
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:
+    """An image without its roll, on a canvas that holds all of it.
+
+    Args:
+        gray: [H, W] uint8.
+        roll: degrees, clockwise.
+
+    Returns:
+        The image, and [2, 3] the map of its pixels (centres at .5) to those of the original.
+    """
+    if not roll:
+        return gray, np.eye(2, 3)
+    cosine, sine = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    turn = np.array([[cosine, -sine], [sine, cosine]])  # original from turned
+    height, width = gray.shape
+    size = np.ceil(np.abs(turn.T) @ (width, height) - 1e-6).astype(int)
+    shift = np.array([width, height]) / 2 - turn @ (size / 2)
+    original_from_turned = np.column_stack([turn, shift])
+    # OpenCV counts pixels from their centres.
+    centred = np.column_stack([turn, shift + turn @ (0.5, 0.5) - 0.5])
+    image = cv2.warpAffine(
+        gray, centred, (int(size[0]), int(size[1])),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.ascontiguousarray(image, np.uint8), original_from_turned
 
 
 def squeezed(gray: npt.NDArray[np.uint8], squeeze: float) -> npt.NDArray[np.uint8]:
@@ -123,7 +190,7 @@ def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArr
 def _sift(
     gray: npt.NDArray[np.uint8], upright: bool, peak_threshold: float, max_features: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Keypoints [K, 3] (x, y, scale in pixels) and RootSIFT descriptors [K, 128] in 0..255."""
+    """Keypoints [K, 4] (x, y, scale, orientation) and RootSIFT descriptors [K, 128] in 0..255."""
     pycolmap = quiet_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -133,8 +200,11 @@ def _sift(
     options.sift.upright = upright
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     keypoints, described = extractor.extract_from_uint8_array(gray)
-    rows = [(point.x, point.y, point.compute_scale()) for point in keypoints]
+    rows = [
+        (point.x, point.y, point.compute_scale(), point.compute_orientation())
+        for point in keypoints
+    ]
     return (
-        np.array(rows, np.float32).reshape(-1, 3),
+        np.array(rows, np.float32).reshape(-1, 4),
         np.array(described.data, np.float32).reshape(len(rows), 128),
     )

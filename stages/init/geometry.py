@@ -25,7 +25,7 @@ MAX_SAMPLED_MATCHES = 800
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera without distortion, shared by the views of one size and one known focal length.
+    """What is known of a lens, shared by the views of one size and one known focal length.
 
     Attributes:
         width, height: pixels.
@@ -40,9 +40,17 @@ class Lens:
     def long_side(self) -> int:
         return max(self.width, self.height)
 
-    def camera(self, focal: float) -> Any:
-        """The pycolmap camera with a focal length in pixels, its centre in the image's middle."""
+    def camera(self, focal: float, distortion: float | None = None) -> Any:
+        """The pycolmap camera with a focal length in pixels, its centre in the image's middle.
+
+        A pinhole, or with a radial coefficient, 0 or not, COLMAP's SIMPLE_RADIAL.
+        """
         pycolmap = quiet_pycolmap()
+        if distortion is not None:
+            return pycolmap.Camera(
+                model="SIMPLE_RADIAL", width=self.width, height=self.height,
+                params=[focal, self.width / 2, self.height / 2, distortion],
+            )  # fmt: skip
         return pycolmap.Camera(
             model="SIMPLE_PINHOLE", width=self.width, height=self.height,
             params=[focal, self.width / 2, self.height / 2],
@@ -57,12 +65,16 @@ class Correspondences:
         features: [M, 2] int64 feature indices.
         positions_i, positions_j: [M, 2] float64 pixels.
         coherent: [M] bool, the match moves along with its neighbours.
+        roll_i, roll_j: degrees by which the photographs are rolled clockwise; whether matches move
+            together is asked with that taken out.
     """
 
     features: npt.NDArray[np.int64]
     positions_i: Array
     positions_j: Array
     coherent: npt.NDArray[np.bool_]
+    roll_i: float = 0.0
+    roll_j: float = 0.0
 
     def __len__(self) -> int:
         return len(self.features)
@@ -149,8 +161,8 @@ def verify_pair(
     inliers = np.flatnonzero(errors <= max_error)
     # Asked again among the inliers: what gave a false match its support may be gone.
     coherent = coherent_matches(
-        correspondences.positions_i[inliers],
-        correspondences.positions_j[inliers],
+        unrolled(correspondences.positions_i[inliers], correspondences.roll_i),
+        unrolled(correspondences.positions_j[inliers], correspondences.roll_j),
         coherence_radius,
     )
     return TwoView(
@@ -215,6 +227,14 @@ def coherent_matches(
     together = near[(apart > radius / 20) & (differ < radius / 8 + 0.35 * apart)]
     np.add.at(support, together.ravel(), 1)
     return support >= neighbours
+
+
+def unrolled(positions: Array, degrees: float) -> Array:
+    """Pixels [M, 2] turned back about the image's corner by a clockwise roll."""
+    if not degrees:
+        return positions
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.asarray(positions @ np.array([[cosine, -sine], [sine, cosine]]))
 
 
 def angle_between(first: Array, second: Array) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.views import View
+from pipeline.artifacts.views import View, to_uint8
 from pipeline.errors import RequestError
 from stages.init.colmap import quiet_pycolmap
 
@@ -220,7 +220,10 @@ def as_pinhole(view: View, known: KnownCamera) -> tuple[View, Camera]:
     pixels = lens.img_from_cam(np.ascontiguousarray((rays @ turn).reshape(-1, 3)))
     pixels = np.where(np.isfinite(pixels), pixels, -1e6)
     source = pixels @ working_from_lens[:2, :2].T + working_from_lens[:2, 2] - 0.5
-    return resampled(view, source.reshape(view.height, view.width, 2)), camera
+    straight = resampled(view, source.reshape(view.height, view.width, 2))
+    parameters = " ".join(f"{value:.9g}" for value in lens.params)
+    text = f"{lens.model_name} {lens.width} {lens.height} {parameters}"
+    return replace(straight, lens_taken_out=text), camera
 
 
 def resampled(view: View, source: npt.NDArray[np.floating[Any]]) -> View:
@@ -242,10 +245,13 @@ def resampled(view: View, source: npt.NDArray[np.floating[Any]]) -> View:
             )
             > 0.5
         )
-    image = np.where(inside[..., None], image, 0)
-    # Eight bits, as images are at rest: the next stage must see what this one saw.
-    image = np.rint(np.clip(image, 0, 1) * 255).astype(np.float32) / np.float32(255)
+    image = rounded(np.where(inside[..., None], image, 0))
     return replace(view, image=image, mask=None if inside.all() else inside)
+
+
+def rounded(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
+    """The image at eight bits, as it is at rest: the next stage must see what this one sees."""
+    return to_uint8(image).astype(np.float32) / np.float32(255)
 
 
 def _working_from_lens(view: View, known: KnownCamera) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,12 @@ import numpy.typing as npt
 
 from stages.init.colmap import quiet_pycolmap
 from stages.init.geometry import Correspondences, Lens, Pair, TwoView
+from stages.init.mappers import MapperOptions, global_models, incremental_models
+from stages.init.undistort import undistort_pixels
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+Distortions = list[float | None]
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,8 @@ class Solution:
     Attributes:
         poses: view index -> [4, 4] cam_from_world.
         focals: view index -> focal length in pixels.
+        distortions: view index -> radial coefficient k1 (see `undistort`); where it is not 0 the
+            pixels below are those of the undistorted image.
         points: [P, 3] world.
         observed_point: [O] int64, point of each observation.
         observed_view: [O] int64, view of each observation.
@@ -40,6 +45,7 @@ class Solution:
     observed_pixel: Array
     residuals: Array
     edges: tuple[Pair, ...] = ()
+    distortions: dict[int, float] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
@@ -103,6 +109,7 @@ def map_views(
     min_tri_angle: float,
     seed: int,
     scratch: Path,
+    distortions: Distortions | None = None,
 ) -> Solution | None:
     """Reconstruct from the pairs in `edges`.
 
@@ -113,6 +120,8 @@ def map_views(
         max_error: reprojection error in pixels beyond which an observation is dropped.
         min_tri_angle: degrees below which a point is dropped.
         scratch: folder for the mapper's database.
+        distortions: for each lens the radial coefficient to start from, to be refined, or None
+            where it is a pinhole; None: all are.
 
     Returns:
         The largest model, or None if there is none.
@@ -120,31 +129,43 @@ def map_views(
     pycolmap = quiet_pycolmap()
     if not edges:
         return None
-    run = {"incremental": _incremental, "global": _global}[method]
+    run = {"incremental": incremental_models, "global": global_models}[method]
+    options = MapperOptions(refine_focal, distortions is not None, max_error, min_tri_angle, seed)
     with tempfile.TemporaryDirectory(dir=scratch) as name:
         folder = Path(name)
         database = folder / "database.db"
-        _write_database(database, given, edges, focals)
-        models = run(pycolmap, database, folder, refine_focal, max_error, min_tri_angle, seed)
+        cameras = lens_cameras(given.lenses, focals, distortions)
+        _write_database(database, given, edges, cameras)
+        models = run(pycolmap, database, folder, options)
     if not models:
         return None
     best = max(sorted(models), key=lambda key: (models[key].num_reg_images(),
                                                 models[key].num_points3D()))  # fmt: skip
-    return _solution(models[best], tuple(sorted(edges)))
+    return solution_of(models[best], tuple(sorted(edges)))
+
+
+def lens_cameras(
+    lenses: list[Lens], focals: list[float], distortions: Distortions | None
+) -> list[Any]:
+    """The pycolmap cameras of lenses, numbered from 1; pinholes where there is no distortion."""
+    cameras = []
+    for index, (lens, focal) in enumerate(zip(lenses, focals, strict=True)):
+        camera = lens.camera(focal, None if distortions is None else distortions[index])
+        camera.camera_id = index + 1
+        camera.has_prior_focal_length = True
+        cameras.append(camera)
+    return cameras
 
 
 def _write_database(
-    path: Path, given: MappingInput, edges: dict[Pair, TwoView], focals: list[float]
+    path: Path, given: MappingInput, edges: dict[Pair, TwoView], cameras: list[Any]
 ) -> None:
     """Write a COLMAP database whose matches are verified already."""
     pycolmap = quiet_pycolmap()
     database = pycolmap.Database.open(str(path))
-    for index, (lens, focal) in enumerate(zip(given.lenses, focals, strict=True), start=1):
-        camera = lens.camera(focal)
-        camera.camera_id = index
-        camera.has_prior_focal_length = True
+    for camera in cameras:
         database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=index)
+        rig = pycolmap.Rig(rig_id=camera.camera_id)
         rig.add_ref_sensor(camera.sensor_id)
         database.write_rig(rig, use_rig_id=True)
     for view, positions in enumerate(given.positions):
@@ -169,98 +190,14 @@ def _write_database(
     database.close()
 
 
-def _incremental(
-    pycolmap: Any, database: Path, folder: Path, refine_focal: bool, max_error: float,
-    min_tri_angle: float, seed: int,
-) -> dict[int, Any]:  # fmt: skip
-    """COLMAP's incremental mapper, lenient enough for three views (FINDINGS, section 1)."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1  # more threads add up residuals in any order
-    options.random_seed = seed
-    options.extract_colors = False
-    options.min_model_size = 2
-    options.max_num_models = 3
-    options.min_num_matches = 8
-    options.ba_refine_focal_length = refine_focal
-    options.ba_refine_extra_params = False
-    # Fewer rounds of bundle adjustment than COLMAP's own: the same poses in 60 % of the time.
-    options.ba_global_frames_ratio = 1.5
-    options.ba_global_points_ratio = 1.5
-    options.ba_local_max_refinements = 1
-    options.ba_global_max_refinements = 2
-    mapper = options.mapper
-    mapper.num_threads = 1
-    mapper.random_seed = seed
-    mapper.init_min_num_inliers = 30
-    mapper.init_min_tri_angle = 2.0
-    mapper.init_max_forward_motion = 1.0  # the test rejects good pairs under a wrong focal length
-    mapper.init_max_error = max_error
-    mapper.init_max_reg_trials = 4
-    mapper.max_reg_trials = 5
-    mapper.abs_pose_max_error = 3 * max_error
-    mapper.abs_pose_min_num_inliers = 8
-    mapper.abs_pose_min_inlier_ratio = 0.1
-    mapper.abs_pose_refine_focal_length = False
-    mapper.abs_pose_refine_extra_params = False
-    mapper.ba_local_min_tri_angle = 3.0
-    mapper.filter_min_tri_angle = min_tri_angle
-    mapper.filter_max_reproj_error = max_error
-    triangulation = options.triangulation
-    triangulation.random_seed = seed
-    triangulation.min_angle = min_tri_angle
-    triangulation.ignore_two_view_tracks = False
-    triangulation.merge_max_reproj_error = max_error
-    triangulation.complete_max_reproj_error = max_error
-    found: dict[int, Any] = pycolmap.incremental_mapping(
-        str(database), str(folder), str(folder), options
-    )
-    return found
-
-
-def _global(
-    pycolmap: Any, database: Path, folder: Path, refine_focal: bool, max_error: float,
-    min_tri_angle: float, seed: int,
-) -> dict[int, Any]:  # fmt: skip
-    """COLMAP's global mapper (GLOMAP), with two-view tracks allowed."""
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = seed
-    options.min_model_size = 2
-    options.min_num_matches = 8
-    mapper = options.mapper
-    mapper.num_threads = 1
-    mapper.random_seed = seed
-    mapper.rotation_averaging.random_seed = seed
-    mapper.global_positioning.random_seed = seed
-    mapper.global_positioning.use_gpu = False
-    mapper.global_positioning.min_num_view_per_track = 2
-    mapper.track_min_num_views_per_track = 2
-    mapper.min_tri_angle_deg = min_tri_angle
-    mapper.bundle_adjustment.min_track_length = 2
-    mapper.bundle_adjustment.refine_focal_length = refine_focal
-    mapper.bundle_adjustment.refine_extra_params = False
-    mapper.bundle_adjustment.ceres.use_gpu = False
-    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-    mapper.retriangulation.ignore_two_view_tracks = False
-    mapper.retriangulation.merge_max_reproj_error = max_error
-    mapper.retriangulation.complete_max_reproj_error = max_error
-    mapper.retriangulation.random_seed = seed
-    found: dict[int, Any] = pycolmap.global_mapping(
-        str(database), str(folder), str(folder), options
-    )
-    return found
-
-
-def _solution(model: Any, edges: tuple[Pair, ...]) -> Solution:
-    """Copy a pycolmap reconstruction into arrays, sorted by identifier."""
-    poses, focals = {}, {}
+def solution_of(model: Any, edges: tuple[Pair, ...]) -> Solution:
+    """Copy a pycolmap reconstruction into arrays, sorted by identifier, without distortion."""
+    poses, lenses = {}, {}
     for image_id in sorted(model.images):
         image = model.images[image_id]
-        if not image.has_pose:
-            continue
-        view = image_id - 1
-        poses[view] = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        focals[view] = float(model.cameras[image.camera_id].focal_length)
+        if image.has_pose:
+            poses[image_id - 1] = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+            lenses[image_id - 1] = model.cameras[image.camera_id]
     points, observed_point, observed_view, observed_pixel = [], [], [], []
     for number, point_id in enumerate(sorted(model.points3D)):
         point = model.points3D[point_id]
@@ -270,19 +207,32 @@ def _solution(model: Any, edges: tuple[Pair, ...]) -> Solution:
             observed_point.append(number)
             observed_view.append(image_id - 1)
             observed_pixel.append(model.images[image_id].points2D[keypoint].xy)
+    pixels = np.array(observed_pixel, np.float64).reshape(-1, 2)
+    views = np.array(observed_view, np.int64)
+    distortions = {
+        view: float(lens.params[3]) if len(lens.params) > 3 else 0.0
+        for view, lens in lenses.items()
+    }
+    focals = {view: float(lens.focal_length) for view, lens in lenses.items()}
+    for view, lens in lenses.items():
+        if distortions[view]:
+            mine = views == view
+            pixels[mine] = undistort_pixels(
+                pixels[mine], focals[view], distortions[view], (lens.width, lens.height)
+            )
     solution = Solution(
         poses=poses,
         focals=focals,
         points=np.array(points, np.float64).reshape(-1, 3),
         observed_point=np.array(observed_point, np.int64),
-        observed_view=np.array(observed_view, np.int64),
-        observed_pixel=np.array(observed_pixel, np.float64).reshape(-1, 2),
+        observed_view=views,
+        observed_pixel=pixels,
         residuals=np.zeros(0),
         edges=edges,
+        distortions=distortions,
     )
-    lenses = {view: model.cameras[model.images[view + 1].camera_id] for view in poses}
     return with_residuals(solution, {
-        view: (lens.principal_point_x, lens.principal_point_y) for view, lens in lenses.items()
+        view: (lens.width / 2, lens.height / 2) for view, lens in lenses.items()
     })  # fmt: skip
 
 

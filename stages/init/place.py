@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from stages.init.classical import Attempt, find_features, match_views, reconstruct
-from stages.init.diagnosis import HOW_TO_SHOOT, Limits, failure
+from stages.init.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
 from stages.init.geometry import Correspondences, Pair
-from stages.init.known import KnownCamera, as_pinhole
-from stages.init.options import REFERENCE_SIDE, ClassicalOptions
+from stages.init.known import KnownCamera, as_pinhole, rounded
+from stages.init.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
 from stages.init.placement import Placement
 from stages.init.triangulate import agreeing_matches, link_tracks, triangulate
+from stages.init.undistort import undistort_image
 
 Progress = Callable[[str, int, int], None]
 Warn = Callable[[str], None]
@@ -38,8 +40,8 @@ def photo_name(view: View) -> str:
 
 def place_classical(
     views: list[View], focals: list[float | None], focal_given: bool, ordered: bool,
-    least_views: int, options: ClassicalOptions, *, seed: int, threads: int, scratch: Path,
-    progress: Progress, warn: Warn,
+    least_views: int, options: ClassicalOptions, refinement: RefinementOptions, *, seed: int,
+    threads: int, scratch: Path, progress: Progress, warn: Warn,
 ) -> Placement:  # fmt: skip
     """Cameras from features and COLMAP's mappers (`stages.init.classical`).
 
@@ -56,24 +58,15 @@ def place_classical(
     attempt = reconstruct(
         [view.gray() for view in views], [view.valid() for view in views], focals, focal_given,
         ordered, options, seed=seed, threads=threads, scratch=scratch, progress=progress,
+        refinement=refinement,
     )  # fmt: skip
     names = [photo_name(view) for view in views]
     limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)
     diagnosis = failure(attempt, names, limits)
     if diagnosis:
         raise ReconstructionError(diagnosis)
-    assert attempt.solution is not None
-    unplaced = [name for view, name in enumerate(names) if view not in attempt.solution.poses]
-    if unplaced:
-        warn(
-            f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
-            f"{', '.join(unplaced)}."
-        )
-    if not attempt.focal_determined:
-        warn(
-            "The photographs don't determine the focal length; the proportions of the scene may be "
-            "off. Keep the EXIF data or pass --set init.focal=..."
-        )
+    for text in warnings_of(attempt, names):
+        warn(text)
     return _from_attempt(views, attempt)
 
 
@@ -82,7 +75,10 @@ def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
     assert solution is not None
     order = sorted(solution.poses)
     number = {view: position for position, view in enumerate(order)}
-    placed = [views[view] for view in order]
+    placed = [
+        _straight(views[view], solution.focals[view], solution.distortions.get(view, 0.0))
+        for view in order
+    ]
     cameras = [
         Camera(
             name=view.name, width=view.width, height=view.height,
@@ -103,6 +99,18 @@ def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
             "reprojection_error_px": round(solution.error, 3),
             "matches": sum(len(edge.inliers) for edge in attempt.evidence.edges.values()),
         },
+    )  # fmt: skip
+
+
+def _straight(view: View, focal: float, k1: float) -> View:
+    """The view as a pinhole with its focal length shows it."""
+    if k1 == 0:
+        return view
+    image, valid = undistort_image(view.image, view.valid(), focal, k1)
+    lens = f"SIMPLE_RADIAL {view.width} {view.height} {focal:.6g} {view.width / 2:g} "
+    return replace(
+        view, image=rounded(image), mask=None if valid.all() else valid,
+        lens_taken_out=f"{lens}{view.height / 2:g} {k1:.6g}",
     )  # fmt: skip
 
 

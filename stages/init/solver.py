@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from stages.init.focal import better, search_focal
-from stages.init.geometry import Pair, TwoView, trusted_edges, verify_pair
-from stages.init.mapping import MappingInput, Solution, map_views
+from stages.init.geometry import Correspondences, Pair, TwoView, trusted_edges, verify_pair
+from stages.init.mapping import Distortions, MappingInput, Solution, map_views
 from stages.init.options import COHERENCE_RADIUS, ClassicalOptions
 from stages.init.parallel import in_threads
+from stages.init.undistort import undistort_pixels
 
+Array = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 #: Focal lengths over the long side that bundle adjustment starts from.
@@ -48,17 +52,26 @@ class Solver:
         self.threads = threads
         self.scratch = scratch
         self.view_count = len(given.positions)
-        self._verified: dict[tuple[float, ...], dict[Pair, TwoView]] = {}
+        self._verified: dict[tuple[float | None, ...], dict[Pair, TwoView]] = {}
         self._last: dict[Pair, TwoView] = {}
 
     def solve_ratio(self, ratio: float, free: bool) -> Solution | None:
         """`solve` with one focal length, over the long side, for all lenses."""
         return self.solve([ratio * lens.long_side for lens in self.given.lenses], free)
 
-    def solve(self, focals: list[float], free: bool, mapper: str | None = None) -> Solution | None:
-        """Verify all pairs at these focal lengths (pixels, one per lens), choose pairs, and map."""
+    def solve(
+        self, focals: list[float], free: bool, mapper: str | None = None,
+        distortions: Distortions | None = None,
+    ) -> Solution | None:  # fmt: skip
+        """Verify all pairs at these focal lengths (pixels, one per lens), choose pairs, and map.
+
+        Args:
+            free: refine the focal lengths.
+            mapper: incremental or global; None: as the options say.
+            distortions: for each lens the radial coefficient to start from, None for pinholes.
+        """
         options = self.options
-        edges = self._last = self._edges(focals)
+        edges = self._last = self._edges(focals, distortions)
         kept = trusted_edges(
             edges, self.view_count,
             min_evidence=options.min_evidence, min_inliers=options.min_inliers,
@@ -70,8 +83,23 @@ class Solver:
             method=mapper or ("global" if options.mapper == "global" else "incremental"),
             max_error=options.max_reprojection_error * self.pixel,
             min_tri_angle=options.min_tri_angle, seed=self.seed, scratch=self.scratch,
+            distortions=distortions,
         )  # fmt: skip
         return solution if solution is not None and len(solution.poses) >= 2 else None
+
+    def links(self) -> list[Pair]:
+        """The pairs that can be believed, at the focal lengths known or tried first."""
+        focals = [lens.focal or STARTS[0] * lens.long_side for lens in self.given.lenses]
+        return self.believed(self._edges(focals))
+
+    def believed(self, edges: dict[Pair, TwoView]) -> list[Pair]:
+        """Those of the pairs that can be believed."""
+        return [
+            pair
+            for pair, edge in edges.items()
+            if edge.evidence >= self.options.min_evidence
+            and len(edge.inliers) >= self.options.min_inliers
+        ]
 
     def with_other_mapper(self, best: Solution, free: bool) -> Solution:
         """Try the global mapper where the incremental one left views out."""
@@ -104,19 +132,43 @@ class Solver:
         usual = float(np.median([focal / lenses[k].long_side for k, focal in found.items()]))
         return [found.get(k, usual * lens.long_side) for k, lens in enumerate(lenses)]
 
+    def distortions_of(self, solution: Solution) -> list[float]:
+        """Radial coefficient of each lens; 0 of one that no placed view has."""
+        of_view = self.given.lens_of_view
+        found = {of_view[view]: k1 for view, k1 in solution.distortions.items()}
+        return [found.get(k, 0.0) for k in range(len(self.given.lenses))]
+
     def edges_used(self, solution: Solution | None) -> dict[Pair, TwoView]:
         """The two-view geometries at the focal length of a solution, or those tried last."""
-        return self._last if solution is None else self._edges(self.focals_of(solution))
+        if solution is None:
+            return self._last
+        bent: Distortions = [k1 or None for k1 in self.distortions_of(solution)]
+        return self._edges(self.focals_of(solution), bent)
 
-    def _edges(self, focals: list[float]) -> dict[Pair, TwoView]:
-        key = tuple(round(focal, 3) for focal in focals)
+    def _edges(
+        self, focals: list[float], distortions: Distortions | None = None
+    ) -> dict[Pair, TwoView]:
+        bends = [k1 or 0.0 for k1 in distortions or [None] * len(focals)]
+        key = (*(round(focal, 3) for focal in focals), *(round(k1, 6) for k1 in bends))
         if key not in self._verified:
             given = self.given
             cameras = [lens.camera(focal) for lens, focal in zip(given.lenses, focals, strict=True)]
 
+            def straight(view: int, pixels: Array) -> Array:
+                lens = given.lens_of_view[view]
+                if not bends[lens]:
+                    return pixels
+                size = (given.lenses[lens].width, given.lenses[lens].height)
+                return undistort_pixels(pixels, focals[lens], bends[lens], size)
+
             def verify(pair: Pair) -> TwoView | None:
+                found: Correspondences = given.correspondences[pair]
                 return verify_pair(
-                    given.correspondences[pair],
+                    replace(
+                        found,
+                        positions_i=straight(pair[0], found.positions_i),
+                        positions_j=straight(pair[1], found.positions_j),
+                    ),
                     cameras[given.lens_of_view[pair[0]]],
                     cameras[given.lens_of_view[pair[1]]],
                     max_error=self.options.max_error * self.pixel,
@@ -180,7 +232,9 @@ def unknown_focal(solver: Solver, free: bool, progress: Progress) -> tuple[Solut
         return solution
 
     result = search_focal(solve)
-    return (result.solution, result.determined) if result else (None, False)
+    if result is None:
+        return None, False
+    return result.solution, result.determined and len(result.solution.poses) > 2
 
 
 def _freed(solver: Solver, many: bool, progress: Progress) -> tuple[Solution | None, bool]:
@@ -202,4 +256,5 @@ def _freed(solver: Solver, many: bool, progress: Progress) -> tuple[Solution | N
     if again is not None and solver.sane(again) and len(again.poses) >= len(best.poses):
         best = again
     agree = len(ends) == len(STARTS) and max(ends) / min(ends) - 1 < SAME_FOCAL
-    return best, agree and solver.complete(best)
+    # Two views fit nearly any focal length; what further views say doesn't hang on all of them.
+    return best, agree and len(best.poses) > 2

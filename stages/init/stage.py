@@ -131,6 +131,7 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 def _from_features(context: StageContext, views: Views) -> None:
     from stages.init.diagnosis import least_views
+    from stages.init.options import RefinementOptions
     from stages.init.place import place_classical, with_focals
     from stages.init.write import densify
 
@@ -139,7 +140,8 @@ def _from_features(context: StageContext, views: Views) -> None:
         placement = place_classical(
             list(views.views), with_focals(views.views, config.focal), config.focal is not None,
             views.ordered, least_views(len(views), config.min_views_fraction),
-            _classical_options(config), seed=context.seed, threads=context.threads,
+            _classical_options(config), RefinementOptions(**config.refinement.model_dump()),
+            seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=context.warn,
         )  # fmt: skip
     except ReconstructionError as unplaced:

@@ -93,8 +93,8 @@ def _write(context: StageContext, views: Views, teeth: Teeth) -> None:
     context.summarize(
         method="dental", upper_teeth=len(upper), lower_teeth=len(lower),
         label_margin=round(teeth.fit.margin, 1),
+        landmark_error_px=round(float(np.median([view.error for view in placed])), 2),
         scale_uncertainty_percent=round(100 * uncertainty, 1),
-        **{name: round(value, 4) for name, value in sorted(teeth.fit.figures.items())},
     )  # fmt: skip
     if config.length.mm is None and not config.dental.tooth_widths:
         context.warn(

@@ -79,3 +79,17 @@ def test_values_survive_the_command_line(value: object) -> None:
     key, parsed = _parse_override(f"a.b={_yaml_value(value)}")
     assert key == "a.b"
     assert parsed == value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a.b=off", "off"),
+        ("a.b=on", "on"),
+        ("a.b=no", "no"),
+        ("a.b=true", True),
+        ("a.b=False", False),
+    ],
+)
+def test_on_and_off_are_words(text: str, value: object) -> None:
+    assert _parse_override(text) == ("a.b", value)

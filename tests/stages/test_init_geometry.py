@@ -1,6 +1,8 @@
 """Two-view geometry, the pair graph, focal length and mapping, on points projected exactly."""
 
 from dataclasses import replace
+from importlib import util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,65 +19,18 @@ from stages.init.geometry import (
     trusted_edges,
     verify_pair,
 )
-from stages.init.mapping import MappingInput, Solution, map_views
+from stages.init.mapping import Solution, map_views
 from stages.init.normalise import moved_points, moved_pose, world_similarity
 from stages.init.options import ClassicalOptions
 from stages.init.solver import Solver, known_focal, unknown_focal
 
-WIDTH, HEIGHT, FOCAL = 512, 384, 700.0
-
-
-def orbit(angles):
-    """Cameras that look at the origin from 5 away, at the yaw angles given (degrees)."""
-    poses = []
-    for angle in angles:
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_euler("xy", [4, angle], degrees=True).as_matrix()
-        pose[:3, 3] = (0.1, 0, 5)
-        poses.append(pose)
-    return poses
-
-
-def make_scene(angles, count=400, noise=0.3, false_share=0.2, seed=0):
-    """Matches among all views of points on a bumpy surface, with noise and false matches."""
-    rng = np.random.default_rng(seed)
-    flat = rng.uniform(-1, 1, (count, 2)) * (1.6, 1.1)
-    depth = 0.5 * np.sin(2 * flat[:, 0]) * np.cos(3 * flat[:, 1]) - 0.4 * flat[:, 0] ** 2
-    points = np.column_stack([flat, depth])
-    poses = orbit(angles)
-    pixels = []
-    for pose in poses:
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        exact = local[:, :2] / local[:, 2:] * FOCAL + (WIDTH / 2, HEIGHT / 2)
-        pixels.append(exact + rng.normal(0, noise, exact.shape))
-    correspondences = {}
-    for i in range(len(poses)):
-        for j in range(i + 1, len(poses)):
-            match = np.stack([np.arange(count)] * 2, 1)
-            wrong = rng.random(count) < false_share
-            match[wrong, 1] = rng.permutation(match[wrong, 1])
-            pair = (pixels[i][match[:, 0]], pixels[j][match[:, 1]])
-            correspondences[i, j] = Correspondences(match, *pair, coherent_matches(*pair, 40.0))
-    given = MappingInput(
-        lenses=[Lens(WIDTH, HEIGHT)],
-        lens_of_view=[0] * len(poses),
-        positions=pixels,
-        points=[np.arange(count)] * len(poses),
-        correspondences=correspondences,
-    )
-    return given, poses
-
-
-def worst_rotation(solution, poses):
-    """Largest error in degrees of the rotations between the first placed view and the others."""
-    first, *others = sorted(solution.poses)
-    return max(
-        angle_between(
-            solution.poses[k][:3, :3] @ solution.poses[first][:3, :3].T,
-            poses[k][:3, :3] @ poses[first][:3, :3].T,
-        )
-        for k in others
-    )
+_spec = util.spec_from_file_location("init_scene", Path(__file__).with_name("init_scene.py"))
+assert _spec is not None
+assert _spec.loader is not None
+_scene = util.module_from_spec(_spec)
+_spec.loader.exec_module(_scene)
+FOCAL, HEIGHT, WIDTH = _scene.FOCAL, _scene.HEIGHT, _scene.WIDTH
+make_scene, orbit, worst_rotation = _scene.make_scene, _scene.orbit, _scene.worst_rotation
 
 
 def edge(rotation, inliers=200, coherence=0.95):

@@ -28,7 +28,7 @@ class DenseOptions:
         range_margin: share of the span of the sparse points' inverse depths added at either end.
         min_ncc: least correlation of a depth that is kept.
         relative_depth, reprojection_px: how well views must agree.
-        min_agreeing: views that must agree; 0: one, or two from six views on.
+        min_agreeing: views that must agree; 0: one, two from 6 views on, three from 12 on.
         front: a depth this share in front of what other views see there is refuted.
         min_variance: grey variance below which a window counts as textureless.
         speckle: islands of fewer pixels are dropped.

@@ -156,7 +156,8 @@ def _consistent(
     depths: list[Array], scores: list[Array], cameras: list[Camera], options: DenseOptions
 ) -> tuple[list[Array], list[npt.NDArray[np.int32]], list[Array]]:
     """Keep what enough other views agree with, averaged with what they say."""
-    needed = options.min_agreeing or (1 if len(depths) < 6 else 2)
+    # What is wrong finds a second witness easily where there are many.
+    needed = options.min_agreeing or 1 + (len(depths) >= 6) + (len(depths) >= 12)
     needed = min(needed, max(len(depths) - 1, 1))
     table = camera_table(cameras)
     stack = stack_depths(depths)

@@ -75,11 +75,11 @@ def reconstruct_teeth(
             f"Teeth could be made out in {found} of {len(views)} photographs; three are needed. "
             f"{HOW_TO_SHOOT_TEETH}"
         )
-    fit = fit_arch(dentitions, images, valid, focals, arch, seed, threads, progress)
+    fit = fit_arch(dentitions, images, valid, focals, arch, seed, threads, progress, names)
     pictures = labelled(views, dentitions, fit)
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
-        shown = [doubt.rstrip(".") + "." for doubt in fit.doubts]
+        shown = [f"{doubt[0].upper()}{doubt[1:].rstrip('.')}." for doubt in fit.doubts]
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
             "Check the labelled photographs; a wrong or missing number can be put right with "

@@ -25,8 +25,8 @@ def crown_width(fit: ArchFit, tooth: int) -> float | None:
         return None
     widths = []
     for kind in ("papilla", "embrasure"):
-        before = fit.landmarks.get(Landmark(kind, order[position - 1], tooth))  # type: ignore[arg-type]
-        after = fit.landmarks.get(Landmark(kind, tooth, order[position + 1]))  # type: ignore[arg-type]
+        before = fit.landmarks.get(Landmark(kind, order[position - 1], tooth))
+        after = fit.landmarks.get(Landmark(kind, tooth, order[position + 1]))
         if before is not None and after is not None:
             widths.append(float(np.linalg.norm(after - before)))
     return float(np.mean(widths)) if widths else None

@@ -1,0 +1,385 @@
+"""Which tooth is which and where the cameras are, from the crowns in a few wide photographs.
+
+The teeth are the landmarks, a textbook arch is the prior: labellings are compared by evidence
+(`hypotheses`, `edits`), the best one is refined with dense matches on the unrolled arch
+(`unrolled`), and what speaks against it is said (`confidence`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import RequestError
+from stages.init.dental.anatomy import Landmark, is_upper
+from stages.init.dental.arch_options import ArchOptions, ToothHint
+from stages.init.dental.bundle import view_angles
+from stages.init.dental.confidence import crown_doubts, fit_doubts, landmark_errors
+from stages.init.dental.edits import MIN_GAIN, Fixed, improve, margins, solve_shifted
+from stages.init.dental.hypotheses import (
+    MAIN_ROLES,
+    Scored,
+    Scorer,
+    roles_of_view,
+    search,
+    view_candidates,
+)
+from stages.init.dental.observation import Dentition
+from stages.init.dental.sightings import JAWS, NO_TOOTH, Labels, seen_rows
+from stages.init.dental.solution import ArchFit, PlacedView
+from stages.init.dental.template import landmark_names, position_of, tooth_at
+from stages.init.dental.unrolled import PairFigures, dense_matches, prepare_photo
+
+__all__ = ["ArchOptions", "ToothHint", "fit_arch"]
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Progress = Callable[[str, int, int], None]
+
+#: A photograph needs this many crowns in all to be placed.
+MIN_CROWNS = 4
+#: Labellings from the search that edits start from, where they are this near the best.
+EDITED, EDIT_WINDOW = 6, 60.0
+#: Then labellings shifted by a tooth that are no more than this worse are edited too, so often.
+SHIFTS, EDIT_GAP = 3, 30.0
+#: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
+MATCHED_YAW = 32.0
+#: The millimetres rest on the focal length or distance expected: relative standard deviation.
+SCALE_UNCERTAINTY = 0.15
+
+
+def fit_arch(
+    dentitions: list[Dentition | None],
+    images: list[Image],
+    valid: list[Mask],
+    focals: list[float | None],
+    options: ArchOptions,
+    seed: int,
+    threads: int,
+    progress: Progress,
+    names: list[str] | None = None,
+) -> ArchFit:
+    """Name the teeth and place the cameras of a few photographs of one patient's closed bite.
+
+    Args:
+        dentitions: what was read from each photograph (`photo.read_dentitions`), None: nothing.
+        images: [H, W, 3] float32 RGB, 0 to 1, of each.
+        valid: [H, W] bool of each; outside, nothing is matched.
+        focals: known focal lengths in pixels of the working image, or None. They are held.
+        options: settings.
+        seed: unused; nothing here is random.
+        threads: threads to use; the result does not depend on them.
+        progress: told (step, done, total).
+        names: how the user knows the photographs; None: "photo 0", "photo 1", ...
+
+    Returns:
+        The fit, in the arch frame (see `PlacedView`). A photograph that can't be placed is None
+        there and named among the doubts; with fewer than two left all are.
+
+    Raises:
+        RequestError: `options.order` or `options.labels` don't fit the photographs.
+        ValueError: the lists are not of one length.
+    """
+    del seed
+    _check(dentitions, images, valid, focals, options)
+    names = names or [f"photo {index}" for index in range(len(dentitions))]
+    doubts: list[str] = []
+    placeable = []
+    for index, dentition in enumerate(dentitions):
+        if dentition is None or not dentition.upper or not dentition.lower:
+            doubts.append(
+                f"{names[index]} could not be placed: no two rows of teeth were found in it"
+            )
+        elif len(dentition.upper) + len(dentition.lower) < MIN_CROWNS:
+            doubts.append(f"{names[index]} could not be placed: it shows too few crowns")
+        else:
+            placeable.append(index)
+    if len(placeable) < 2:
+        doubts.append("fewer than two photographs show teeth well enough")
+        return ArchFit((None,) * len(dentitions), {}, {}, 0.0, tuple(doubts))
+    read = [dentition for dentition in (dentitions[i] for i in placeable) if dentition is not None]
+    inner = replace(
+        options,
+        order=None if options.order is None else tuple(options.order[i] for i in placeable),
+    )
+    fixed = _fixed_labels(options.labels, placeable, read, names)
+    focal, deviation = _focal_priors([focals[i] for i in placeable], read, options)
+    rows = [seen_rows(dentition) for dentition in read]
+    shown = [names[i] for i in placeable]
+
+    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads)
+    best, others = _label(scorer, fixed, progress)
+    if inner.order is not None:
+        best, others, scorer, contradiction = _keep_order(
+            Scorer(rows, focal, deviation, inner, threads), fixed, scorer, best, others, shown,
+            progress,
+        )  # fmt: skip
+        doubts += contradiction
+    elif len(placeable) == 3:
+        doubts += _role_doubts(best)
+    gaps = margins(best, others)
+
+    best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],
+                          [valid[i] for i in placeable], options, progress)  # fmt: skip
+    bands = [dentition.band_height for dentition in read]
+    doubts += crown_doubts(shown, read, options)
+    more, figures = fit_doubts(shown, bands, scorer, best, gaps, pairs, options)
+    doubts += more
+    return _outcome(scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures)
+
+
+def _check(
+    dentitions: list[Dentition | None],
+    images: list[Image],
+    valid: list[Mask],
+    focals: list[float | None],
+    options: ArchOptions,
+) -> None:
+    """Refuse what doesn't fit together."""
+    count = len(dentitions)
+    if not count == len(images) == len(valid) == len(focals):
+        raise ValueError(
+            f"{count} dentitions, {len(images)} images, {len(valid)} masks and {len(focals)} focal "
+            f"lengths were given; there must be one of each per photograph."
+        )
+    if options.order is not None:
+        known = (*MAIN_ROLES, "between")
+        if len(options.order) != count or any(role not in known for role in options.order):
+            raise RequestError(
+                f"The order {','.join(options.order)} does not fit {count} photographs: give one "
+                f"of {', '.join(known)} for each photograph, in file order."
+            )
+
+
+def _fixed_labels(
+    hints: tuple[ToothHint, ...], placeable: list[int], dentitions: list[Dentition],
+    names: list[str],
+) -> Fixed:  # fmt: skip
+    """Hints to (view, jaw, crown) -> position; the nearest crown of the tooth's jaw is meant."""
+    fixed: Fixed = {}
+    for hint in hints:
+        if hint.photo not in placeable:
+            raise RequestError(
+                f"The hint for tooth {hint.tooth} names {names[hint.photo]}, in which no teeth "
+                f"were found; photographs with teeth: {', '.join(names[i] for i in placeable)}."
+            )
+        try:
+            position = position_of(hint.tooth)
+        except ValueError:
+            raise RequestError(
+                f"The hint for {names[hint.photo]} names tooth {hint.tooth}, which is no FDI "
+                f"number of a permanent tooth from incisor to second molar (11-17, 21-27, 31-37, "
+                f"41-47)."
+            ) from None
+        jaw = 0 if is_upper(hint.tooth) else 1
+        view = placeable.index(hint.photo)
+        crowns = dentitions[view].crowns(JAWS[jaw])
+        point = np.array([hint.x, hint.y])
+        distances = [float(np.linalg.norm((c.zenith + c.tip) / 2 - point)) for c in crowns]
+        nearest = int(np.argmin(distances))
+        if distances[nearest] > crowns[nearest].height:
+            raise RequestError(
+                f"The hint for tooth {hint.tooth} points at ({hint.x:.0f}, {hint.y:.0f}) in "
+                f"{names[hint.photo]}, where there is no {JAWS[jaw]} crown; the nearest is at "
+                f"({crowns[nearest].zenith[0]:.0f}, {crowns[nearest].zenith[1]:.0f})."
+            )
+        fixed[view, jaw, nearest] = position
+    return fixed
+
+
+def _focal_priors(
+    focals: list[float | None], dentitions: list[Dentition], options: ArchOptions
+) -> tuple[Array, Array]:
+    """Focal lengths in pixels and their relative standard deviations (0 where known)."""
+    values, deviations = [], []
+    for focal, dentition in zip(focals, dentitions, strict=True):
+        # Of the long side: turning the camera upright does not change its lens.
+        values.append(focal or options.focal_per_side * max(dentition.mask.shape))
+        deviations.append(0.0 if focal else options.focal_deviation)
+    return np.array(values, np.float64), np.array(deviations, np.float64)
+
+
+def _label(scorer: Scorer, fixed: Fixed, progress: Progress) -> tuple[Scored, list[Scored]]:
+    """The best labelling of all views and others that were solved."""
+    count = len(scorer.rows)
+    candidates = {}
+    for view in range(count):
+        progress("teeth of each photo", view, count)
+        roles = roles_of_view(view, count, scorer.options)
+        candidates[view] = view_candidates(scorer, view, roles, fixed)
+        if not candidates[view]:
+            raise RequestError(
+                "The tooth numbers given for one photograph contradict each other: from left to "
+                "right each crown is the next tooth of its row."
+            )
+    progress("numbering the teeth", 0, 1)
+    found = search(scorer, candidates)
+    starts: list[Scored] = []
+    for scored in found:
+        near = scored.score < found[0].score + EDIT_WINDOW
+        # The same numbers in other roles would be edited to the same end.
+        new = all(scored.labelling.labels != start.labelling.labels for start in starts)
+        if near and new and len(starts) < EDITED:
+            starts.append(scored)
+    improved: list[Scored] = []
+    others = list(found)
+    for start in starts:
+        better, tried = improve(scorer, start, fixed)
+        improved.append(better)
+        others += tried
+    best = min(improved, key=lambda s: (s.score, s.labelling.labels))
+    others += [s for s in improved if s is not best]
+    for _ in range(SHIFTS):
+        # Edits move a row at a time; what is off by a tooth in all views needs this.
+        shifted = solve_shifted(scorer, best, fixed)
+        others += shifted
+        rival = min(shifted, key=lambda s: (s.score, s.labelling.labels), default=best)
+        if rival.score > best.score + EDIT_GAP:
+            break
+        better, tried = improve(scorer, rival, fixed)
+        others += [*tried, better]
+        if better.score > best.score - MIN_GAIN:
+            break
+        others.append(best)
+        best = better
+    progress("numbering the teeth", 1, 1)
+    return best, others
+
+
+def _keep_order(
+    ordered: Scorer,
+    fixed: Fixed,
+    free: Scorer,
+    free_best: Scored,
+    free_others: list[Scored],
+    photos: list[str],
+    progress: Progress,
+) -> tuple[Scored, list[Scored], Scorer, list[str]]:
+    """Hold the order given, unless the teeth clearly say otherwise: then say what is wrong."""
+    best, others = _label(ordered, fixed, progress)
+    given = best.labelling.roles
+    found = free_best.labelling.roles
+    if found == given or free_best.score > best.score - ordered.options.min_margin:
+        return best, others, ordered, []
+    wrong = [
+        f"{photo} (given as {_plain(a)}, looks like {_plain(b)})"
+        for photo, a, b in zip(photos, given, found, strict=True)
+        if _plain(a) != _plain(b)
+    ]
+    sides = {_plain(a) for a, b in zip(given, found, strict=True) if a != b}
+    hint = "the order is wrong"
+    if sides == {"right", "left"}:
+        hint = "left and right are swapped, or the photographs are mirrored"
+    sentence = f"the order given contradicts the teeth: {hint}; see {', '.join(wrong)}"
+    return free_best, free_others, free, [sentence] if wrong else []
+
+
+def _plain(role: str) -> str:
+    """The role's name as users know it."""
+    return "between" if role.startswith("between") else role
+
+
+def _role_doubts(best: Scored) -> list[str]:
+    """Three photographs are one from each side and one from the front."""
+    roles = best.labelling.roles
+    absent = [role for role in MAIN_ROLES if role not in roles]
+    if not absent:
+        return []
+    twice = [role for role in MAIN_ROLES if roles.count(role) > 1]
+    return [
+        f"{roles.count(twice[0])} photographs look like {twice[0]} views and none like a "
+        f"{' or a '.join(absent)} view: one of them may be mirrored, or taken twice"
+    ]
+
+
+def _refine(
+    scorer: Scorer,
+    best: Scored,
+    dentitions: list[Dentition],
+    images: list[Image],
+    valid: list[Mask],
+    options: ArchOptions,
+    progress: Progress,
+) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
+    """Rounds of dense matches on the unrolled arch and bundle adjustment."""
+    photos = [
+        prepare_photo(image, use, dentition.mask, dentition.roll, dentition.band_height)
+        for image, use, dentition in zip(images, valid, dentitions, strict=True)
+    ]
+    pairs: dict[tuple[int, int], PairFigures] = {}
+    for done in range(options.dense_rounds):
+        progress("dense matches on the arch", done, options.dense_rounds)
+        yaws = view_angles(best.adjusted)[:, 0]
+        order = np.argsort(yaws, kind="stable")
+        wanted = {(int(a), int(b)) for a, b in pairwise(order)}
+        wanted |= {
+            (int(a), int(b))
+            for a, b in zip(order[:-2], order[2:], strict=True)
+            if yaws[b] - yaws[a] < MATCHED_YAW
+        }
+        matches, pairs = dense_matches(
+            best.adjusted, photos, sorted(wanted), options.chart_scale, options.dense_weight
+        )
+        start = (best.adjusted.unknowns, best.adjusted.offsets)
+        best = scorer.solve(best.labelling, start, matches=matches)
+    progress("dense matches on the arch", options.dense_rounds, options.dense_rounds)
+    return best, pairs
+
+
+def _outcome(
+    scorer: Scorer,
+    best: Scored,
+    dentitions: list[Dentition],
+    photos: list[int],
+    count: int,
+    gap: float,
+    doubts: list[str],
+    figures: dict[str, float],
+) -> ArchFit:
+    """The fit in the terms of the contract."""
+    adjusted, labelling = best.adjusted, best.labelling
+    sightings = scorer.cache.collect(list(labelling.views), list(labelling.labels))
+    errors = landmark_errors(adjusted, sightings)
+    views: list[PlacedView | None] = [None] * count
+    for view, photo in enumerate(photos):
+        c, s = np.cos(dentitions[view].roll), np.sin(dentitions[view].roll)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ adjusted.rotations[view]
+        pose[:3, 3] = turn @ adjusted.translations[view]
+        mine = sightings.view == view
+        views[photo] = PlacedView(
+            cam_from_world=pose,
+            focal=float(adjusted.focals[view]),
+            role=_plain(labelling.roles[view]),
+            upper=_teeth(0, labelling.labels[view][0]),
+            lower=_teeth(1, labelling.labels[view][1]),
+            error=float(np.median(errors[mine])) if mine.any() else float("inf"),
+        )
+    names = landmark_names()
+    gone = labelling.absent
+    shape: dict[Landmark, Array] = {
+        name: adjusted.points[i]
+        for i, name in enumerate(names)
+        if name.tooth not in gone and name.neighbour not in gone
+    }
+    seen = {names[i] for i in np.unique(sightings.landmark)}
+    return ArchFit(
+        views=tuple(views),
+        landmarks={name: point for name, point in shape.items() if name in seen},
+        shape=shape,
+        margin=float(gap),
+        doubts=tuple(doubts),
+        scale_uncertainty=SCALE_UNCERTAINTY,
+        figures=figures,
+    )
+
+
+def _teeth(jaw: int, labels: Labels) -> tuple[int, ...]:
+    """FDI numbers of a row's labels, 0 for no tooth."""
+    return tuple(0 if label == NO_TOOTH else tooth_at(JAWS[jaw], label) for label in labels)

@@ -1,0 +1,85 @@
+"""Settings of `fit_arch`. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ToothHint:
+    """The FDI number of one crown, as a person says it: "photo 0, point x, y = 16".
+
+    Attributes:
+        photo: index of the photograph, from 0, in the order given.
+        x, y: a point on the crown, pixels of the working image.
+        tooth: its FDI number (11-17, 21-27, 31-37, 41-47).
+    """
+
+    photo: int
+    x: float
+    y: float
+    tooth: int
+
+
+@dataclass(frozen=True)
+class ArchOptions:
+    """Settings of `fit_arch`.
+
+    Angles are in degrees, lengths in millimetres, image errors as shares of the band of teeth (the
+    distance from the upper to the lower gum line in the photograph, about 15 mm).
+    """
+
+    #: What each photograph is, in file order: `right`, `frontal`, `left` or `between`; None: found.
+    order: tuple[str, ...] | None = None
+    #: Crowns whose FDI number is known.
+    labels: tuple[ToothHint, ...] = ()
+    #: Focal length expected where it is unknown, as a multiple of the image's long side, and its
+    #: relative standard deviation.
+    focal_per_side: float = 1.9
+    focal_deviation: float = 0.12
+    #: Camera distance expected, and its relative standard deviation.
+    distance: float = 125.0
+    distance_deviation: float = 0.15
+    #: Side views are expected at plus and minus this yaw, within these standard deviations.
+    side_yaw: float = 42.0
+    side_yaw_deviation: float = 15.0
+    frontal_yaw_deviation: float = 8.0
+    elevation: float = 4.0
+    elevation_deviation: float = 8.0
+    roll_deviation: float = 6.0
+    #: How far a patient's landmark lies from the textbook arch after that has been stretched.
+    landmark_deviation: float = 1.2
+    #: What a landmark that a labelling leaves unused costs (twice the log likelihood).
+    unused_cost: float = 8.0
+    #: What it costs to call a tooth missing in all photographs, or a crown merged, split or none.
+    missing_cost: float = 20.0
+    defect_cost: float = 12.0
+    #: Labellings kept per photograph, and jointly, while searching.
+    candidates_per_view: int = 10
+    beam: int = 16
+    #: Rounds of dense matching on the unrolled arch (0: landmarks alone).
+    dense_rounds: int = 3
+    #: Pixels per millimetre of the unrolled arch.
+    chart_scale: float = 8.0
+    #: Total weight of the dense matches of a pair, in matches; where they dominate the landmarks
+    #: the cameras drift.
+    dense_weight: float = 40.0
+    #: Below this margin another labelling is nearly as good: doubt.
+    min_margin: float = 15.0
+    #: The same for labellings that differ in a crown or two.
+    min_local_margin: float = 5.0
+    #: The same for labellings that take other teeth for missing.
+    min_missing_margin: float = 6.0
+    #: Median landmark error above which the fit is doubted.
+    max_error: float = 0.045
+    #: Standard deviation of the angle between neighbouring views above which it is doubted.
+    max_angle_deviation: float = 6.0
+    #: Share of the crowns, those at the ends of the rows apart, left without a number above which
+    #: a photograph is doubted.
+    max_unnamed: float = 0.1
+    #: Crowns per jaw and photograph below which a photograph is doubted.
+    min_crowns: int = 4
+    #: Dense matches between neighbouring photographs below which a pair is doubted, as a share of
+    #: the chart that both see; and the median distance from the epipolar line above which it is.
+    min_dense_share: float = 0.01
+    max_epipolar_error: float = 0.015

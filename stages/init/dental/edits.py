@@ -1,0 +1,317 @@
+"""Labellings near a given one: gaps, missing teeth, merged and spurious crowns, shifts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.anatomy import is_upper
+from stages.init.dental.bundle import Adjusted, adjust, view_angles
+from stages.init.dental.bundle_kernels import PER_ARCH, PER_VIEW
+from stages.init.dental.hypotheses import (
+    FINAL_STEPS,
+    SEARCH_STEPS,
+    Labelling,
+    Scored,
+    Scorer,
+    ViewLabels,
+    contiguous,
+    row_defects,
+)
+from stages.init.dental.sightings import JAWS, NO_TOOTH, Labels
+from stages.init.dental.template import POSITIONS, position_of, tooth_at
+
+Array = npt.NDArray[np.float64]
+Fixed = dict[tuple[int, int, int], int]
+
+#: When one row's labels are tried against the arch of the other views, its landmarks may still be
+#: this far off (mm).
+TRIED_DEVIATION = 0.8
+#: Edits of a row that look best against that arch and are solved jointly.
+JOINT_TRIALS = 12
+#: Steps of the solver for such a trial.
+TRIAL_STEPS = 6
+#: An edit must gain this much to be taken.
+MIN_GAIN = 1.0
+#: Edits taken one after another at most.
+MAX_EDITS = 6
+#: Labellings next to the best that are solved to the end, to know the margin.
+NEAREST = 5
+#: Labellings count as different ones when they name more crowns differently than this.
+SAME_BUT_FOR = 2
+
+
+def _bounded(labels: list[int]) -> Labels:
+    """Labels with those beyond the row's ends made `NO_TOOTH`."""
+    return tuple(label if 0 <= label < POSITIONS else NO_TOOTH for label in labels)
+
+
+def _shifted(labels: Labels, chosen: list[bool], by: int) -> list[int]:
+    """Labels with those chosen moved along the row."""
+    return [
+        label + by if take and label != NO_TOOTH else label
+        for label, take in zip(labels, chosen, strict=True)
+    ]
+
+
+def row_edits(labels: Labels) -> list[Labels]:
+    """Other labels of one row: a gap, a crown that is none or two, no gaps at all, a shift."""
+    count = len(labels)
+    edits: set[Labels] = set()
+    for i, label in enumerate(labels):
+        if label == NO_TOOTH:
+            continue
+        edits.add(contiguous(label - i, count))
+        if i in (0, count - 1):
+            continue  # a row's ends are cut off and show little more than the neighbours' papillae
+        for side in (-1, 1):
+            beyond = [(k - i) * side > 0 for k in range(count)]
+            if any(beyond):
+                edits.add(_bounded(_shifted(labels, beyond, side)))
+            for by in (-side, side):
+                changed = _shifted(labels, beyond, by)
+                changed[i] = NO_TOOTH
+                edits.add(_bounded(changed))
+            if 0 < i + side < count - 1:
+                changed = _shifted(labels, beyond, -side)
+                changed[i] = changed[i + side] = NO_TOOTH
+                edits.add(_bounded(changed))
+    for by in (-1, 1):
+        edits.add(_bounded(_shifted(labels, [True] * count, by)))
+    edits.discard(labels)
+    return sorted(
+        edit
+        for edit in edits
+        if all(b > a for a, b in _named_pairs(edit)) and sum(e != NO_TOOTH for e in edit) >= 2
+    )
+
+
+def _named_pairs(labels: Labels) -> Iterator[tuple[int, int]]:
+    named = [label for label in labels if label != NO_TOOTH]
+    return pairwise(named)
+
+
+def _allowed(view: int, jaw: int, labels: Labels, fixed: Fixed) -> bool:
+    return all(
+        labels[crown] == position
+        for (v, j, crown), position in fixed.items()
+        if (v, j) == (view, jaw)
+    )
+
+
+def with_row(labelling: Labelling, number: int, jaw: int, labels: Labels) -> Labelling:
+    """A labelling with one row replaced; `number` counts its views."""
+    rows: ViewLabels = (
+        (labels, labelling.labels[number][1]) if jaw == 0 else (labelling.labels[number][0], labels)
+    )
+    changed = (*labelling.labels[:number], rows, *labelling.labels[number + 1 :])
+    return replace(labelling, labels=changed)
+
+
+def missing_tooth_edits(labelling: Labelling, adjusted: Adjusted) -> list[Labelling]:
+    """A tooth missing in the patient, its space open or closed; or one called missing that is not.
+
+    The numbers beyond the gap move outward in every photograph; or, in the one taken most from its
+    side, the numbers before it move inward.
+    """
+    edits: list[Labelling] = []
+    for jaw, name in enumerate(JAWS):
+        for position in range(POSITIONS):
+            tooth = tooth_at(name, position)
+            if tooth in labelling.absent:
+                continue
+            inside = [
+                number
+                for number, labels in enumerate(labelling.labels)
+                if position in labels[jaw][1:-1]
+            ]
+            if not inside:
+                continue
+            outward = -1 if position < POSITIONS // 2 else 1
+            # The photograph taken most from this tooth's side: there the back teeth may have held.
+            yaws = view_angles(adjusted)[:, 0] * outward
+            sideways = max(inside, key=lambda number: (float(yaws[number]), number))
+            for inward_view in (-1, sideways):
+                changed = labelling
+                for number, labels in enumerate(labelling.labels):
+                    row = labels[jaw]
+                    if number == inward_view:
+                        chosen = [(label - position) * outward <= 0 for label in row]
+                        new = _bounded(_shifted(row, chosen, -outward))
+                    else:
+                        chosen = [(label - position) * outward >= 0 for label in row]
+                        new = _bounded(_shifted(row, chosen, outward))
+                    changed = with_row(changed, number, jaw, new)
+                absent = labelling.absent | {tooth}
+                edits.append(replace(changed, absent=absent))
+                edits.append(replace(changed, absent=absent, closed=labelling.closed | {tooth}))
+    return edits
+
+
+def without_view(scorer: Scorer, scored: Scored, number: int) -> Scored:
+    """The same labelling without one of its views, solved."""
+    labelling = scored.labelling
+    rest = [k for k in range(len(labelling.views)) if k != number]
+    fewer = replace(
+        labelling,
+        views=tuple(labelling.views[k] for k in rest),
+        roles=tuple(labelling.roles[k] for k in rest),
+        labels=tuple(labelling.labels[k] for k in rest),
+    )
+    cameras = scored.adjusted.unknowns[:-PER_ARCH].reshape(-1, PER_VIEW)[rest]
+    unknowns = np.concatenate([cameras.ravel(), scored.adjusted.unknowns[-PER_ARCH:]])
+    return scorer.solve(fewer, (unknowns, scored.adjusted.offsets), SEARCH_STEPS)
+
+
+def row_trial(
+    scorer: Scorer, scored: Scored, points: Array, number: int, labels: ViewLabels
+) -> float:
+    """Score of one view's labels against an arch [L, 3] (only to compare with others)."""
+    labelling = scored.labelling
+    view, role = labelling.views[number], labelling.roles[number]
+    start = np.concatenate(
+        [
+            scored.adjusted.unknowns[PER_VIEW * number : PER_VIEW * (number + 1)],
+            np.zeros(PER_ARCH),
+        ]
+    )
+    adjusted = adjust(
+        scorer.cache.collect([view], [labels]),
+        points,
+        scorer.priors((view,), (role,)),
+        TRIED_DEVIATION,
+        start=(start, np.zeros_like(scored.adjusted.offsets)),
+        max_steps=TRIAL_STEPS,
+        tolerance=0.05,
+    )
+    options = scorer.options
+    total = adjusted.evidence + options.unused_cost * scorer.cache.unused(view, labels)
+    for jaw in (0, 1):
+        absent = frozenset(position_of(t) for t in labelling.absent if is_upper(t) == (jaw == 0))
+        total += options.defect_cost * row_defects(labels[jaw], absent)
+    return total
+
+
+def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[Scored]]:
+    """Take edits as long as they gain.
+
+    Args:
+        scorer: of all photographs.
+        scored: where to begin.
+        fixed: (view, jaw, crown) -> position, where a person has said it.
+
+    Returns:
+        The best labelling found, and all others that were solved jointly on the way.
+    """
+    others: list[Scored] = []
+    for _ in range(MAX_EDITS):
+        labelling = scored.labelling
+        trials: list[tuple[float, Labelling]] = []
+        for number, labels in enumerate(labelling.labels):
+            # The arch as the other views have it: this view's errors must not be built in.
+            points = without_view(scorer, scored, number).adjusted.points
+            now = row_trial(scorer, scored, points, number, labels)
+            for jaw in (0, 1):
+                for edit in row_edits(labels[jaw]):
+                    if not _allowed(labelling.views[number], jaw, edit, fixed):
+                        continue
+                    changed = with_row(labelling, number, jaw, edit)
+                    score = row_trial(scorer, scored, points, number, changed.labels[number])
+                    trials.append((score - now, changed))
+        trials.sort(key=lambda trial: (trial[0], trial[1].labels))
+        jobs = [changed for _, changed in trials[:JOINT_TRIALS]]
+        jobs += [
+            edit
+            for edit in missing_tooth_edits(labelling, scored.adjusted)
+            if all(
+                _allowed(view, jaw, edit.labels[number][jaw], fixed)
+                for number, view in enumerate(edit.views)
+                for jaw in (0, 1)
+            )
+        ]
+        start = (scored.adjusted.unknowns, scored.adjusted.offsets)
+        solved = scorer.solve_all([(job, start) for job in jobs], SEARCH_STEPS)
+        solved.sort(key=lambda s: (s.score, s.labelling.labels))
+        again = [(s.labelling, (s.adjusted.unknowns, s.adjusted.offsets)) for s in solved[:3]]
+        finished = scorer.solve_all(list(again), FINAL_STEPS)
+        finished.sort(key=lambda s: (s.score, s.labelling.labels))
+        others += finished + solved[3:]
+        if not finished or finished[0].score > scored.score - MIN_GAIN:
+            break
+        others.append(scored)
+        scored = finished[0]
+    return scored, others
+
+
+def differences(a: Labelling, b: Labelling) -> int:
+    """How many crowns two labellings name differently, the ends of the rows apart."""
+    count = 0
+    for mine, theirs in zip(a.labels, b.labels, strict=True):
+        for jaw in (0, 1):
+            inner = slice(1, -1)
+            for x, y in zip(mine[jaw][inner], theirs[jaw][inner], strict=True):
+                count += x != y and NO_TOOTH not in (x, y)
+    return count
+
+
+def shifted_labellings(labelling: Labelling) -> list[Labelling]:
+    """Labellings a tooth off: one view or all, one jaw or both."""
+    views = range(len(labelling.labels))
+    result = []
+    for chosen in [[number] for number in views] + [list(views)]:
+        for jaws in ((0, 1), (0,), (1,)):
+            for by in (-1, 1):
+                changed = labelling
+                for number in chosen:
+                    for jaw in jaws:
+                        row = labelling.labels[number][jaw]
+                        new = _bounded(_shifted(row, [True] * len(row), by))
+                        changed = with_row(changed, number, jaw, new)
+                result.append(changed)
+    return result
+
+
+def solve_shifted(scorer: Scorer, best: Scored, fixed: Fixed) -> list[Scored]:
+    """Labellings a tooth off the best one, solved; those against what a person has said left out.
+
+    Args:
+        scorer: of all photographs.
+        best: the labelling to compare with.
+        fixed: (view, jaw, crown) -> position, where a person has said it.
+    """
+    shifted = [
+        labelling
+        for labelling in shifted_labellings(best.labelling)
+        if all(
+            _allowed(view, jaw, labelling.labels[number][jaw], fixed)
+            for number, view in enumerate(labelling.views)
+            for jaw in (0, 1)
+        )
+    ]
+    start = (best.adjusted.unknowns, best.adjusted.offsets)
+    solved = scorer.solve_all([(labelling, start) for labelling in shifted], SEARCH_STEPS)
+    solved.sort(key=lambda s: (s.score, s.labelling.labels))
+    again = [(s.labelling, (s.adjusted.unknowns, s.adjusted.offsets)) for s in solved[:NEAREST]]
+    return scorer.solve_all(list(again), FINAL_STEPS) + solved[NEAREST:]
+
+
+def margins(best: Scored, others: list[Scored]) -> tuple[float, float, float]:
+    """By how much the best labelling beats the next (log evidence, twice).
+
+    Returns:
+        The margin over labellings with the same missing teeth, over those with others, and over
+        those that differ in a crown or two only; infinite where there is none.
+    """
+    gaps: tuple[list[float], ...] = ([float("inf")], [float("inf")], [float("inf")])
+    for other in others:
+        count = differences(best.labelling, other.labelling)
+        same = other.labelling.absent == best.labelling.absent
+        if count > SAME_BUT_FOR:
+            gaps[0 if same else 1].append(other.score - best.score)
+        elif count:
+            gaps[2].append(other.score - best.score)
+    return min(gaps[0]), min(gaps[1]), min(gaps[2])

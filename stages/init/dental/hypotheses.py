@@ -1,0 +1,333 @@
+"""Which tooth is which: labellings compared by their evidence.
+
+A crown's label is a position along its row (see `sightings`). Every labelling is solved (`bundle`)
+and scored by cost + log determinant of the Hessian + what landmarks left unused, missing teeth and
+defective crowns cost: twice the negative log evidence. The determinant matters: a labelling shifted
+by a tooth shares fewer landmarks between the views and so fits more easily.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.anatomy import is_upper
+from stages.init.dental.arch_options import ArchOptions
+from stages.init.dental.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
+from stages.init.dental.bundle_kernels import PER_ARCH, PER_VIEW
+from stages.init.dental.sightings import NO_TOOTH, Labels, SeenRow, SightingCache
+from stages.init.dental.template import POSITIONS, position_of, textbook_arch
+
+Array = npt.NDArray[np.float64]
+ViewLabels = tuple[Labels, Labels]
+
+#: Roles that three photographs have, and the ones that further photographs may have too.
+MAIN_ROLES = ("right", "frontal", "left")
+#: `between` lies on one side or the other; the name tells which while searching.
+BETWEEN_ROLES = ("between right", "between left")
+#: What it costs that two of three photographs have the same role.
+REPEATED_ROLE_COST = 15.0
+#: Labellings of a view further behind its best one than this are not looked at (evidence).
+VIEW_WINDOW = 60.0
+#: Pairs of partial labelling and view's candidate solved in each step of the search.
+PAIRS_A_STEP = 120
+#: Upper and lower positions above each other differ by no more than this.
+MAX_JAW_SHIFT = 2.2
+#: Steps of the solver: for one view alone, while searching, at the end.
+VIEW_STEPS, SEARCH_STEPS, FINAL_STEPS = 12, 8, 40
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """A hypothesis about some of the views.
+
+    Attributes:
+        views: indices of the photographs.
+        roles: of each.
+        labels: (upper, lower) positions of the crowns of each.
+        absent: FDI numbers of teeth that no photograph shows though their neighbours are shown.
+        closed: those of them whose space the teeth behind have closed.
+    """
+
+    views: tuple[int, ...]
+    roles: tuple[str, ...]
+    labels: tuple[ViewLabels, ...]
+    absent: frozenset[int] = frozenset()
+    closed: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A labelling, solved.
+
+    Attributes:
+        labelling: the hypothesis.
+        adjusted: its solution.
+        score: twice the negative log evidence with all costs.
+    """
+
+    labelling: Labelling
+    adjusted: Adjusted
+    score: float
+
+
+def contiguous(first: int, count: int) -> Labels:
+    """Labels of a row without gaps that begins at position `first`; none beyond the ends."""
+    return tuple(first + i if 0 <= first + i < POSITIONS else NO_TOOTH for i in range(count))
+
+
+def row_defects(labels: Labels, absent: frozenset[int]) -> int:
+    """How many crowns of a row are merged, split, spurious or skipped under its labels.
+
+    Args:
+        labels: positions of the row's crowns.
+        absent: positions of this jaw that are missing in the patient.
+    """
+    named = [i for i, label in enumerate(labels) if label != NO_TOOTH]
+    defects = 0
+    for i, j in pairwise(named):
+        nameless = j - i - 1
+        skipped = sum(p not in absent for p in range(labels[i] + 1, labels[j]))
+        if nameless or skipped:
+            # One crown for two teeth and two crowns for one are one defect each.
+            defects += max(1, abs(nameless - skipped))
+    if named:
+        # Beyond the named ones: the last crown of a row is cut off and may be anything.
+        first, last = named[0], named[-1]
+        before = sum(labels[first] - (first - k) >= 0 for k in range(1, first))
+        after = range(last + 1, len(labels) - 1)
+        defects += before + sum(labels[last] + (k - last) < POSITIONS for k in after)
+    return defects
+
+
+class Scorer:
+    """Solves and scores labellings of one set of photographs."""
+
+    def __init__(
+        self,
+        rows: list[tuple[SeenRow, SeenRow]],
+        focals: Array,
+        focal_deviations: Array,
+        options: ArchOptions,
+        threads: int,
+    ) -> None:
+        self.rows = rows
+        self.cache = SightingCache(rows)
+        self.focals, self.focal_deviations = focals, focal_deviations
+        self.options = options
+        self.threads = threads
+        self.solved = 0
+        side, spread = options.side_yaw, options.side_yaw_deviation
+        self._yaw_of = {
+            "right": (-side, spread),
+            "left": (side, spread),
+            "frontal": (0.0, options.frontal_yaw_deviation),
+            # Half way, and as wide as is left between the others.
+            "between right": (-side / 2, spread),
+            "between left": (side / 2, spread),
+        }
+
+    def priors(self, views: tuple[int, ...], roles: tuple[str, ...]) -> CameraPriors:
+        """Camera priors of some views in their roles."""
+        options = self.options
+        yaws = [self._yaw_of[role] for role in roles]
+        angles = [
+            (options.elevation_deviation, spread, options.roll_deviation) for _, spread in yaws
+        ]
+        return CameraPriors(
+            yaws=np.array([yaw for yaw, _ in yaws], np.float64),
+            angle_deviations=np.array(angles, np.float64).reshape(-1, 3),
+            elevation=options.elevation,
+            distance=options.distance,
+            distance_deviation=options.distance_deviation,
+            focals=np.ascontiguousarray(self.focals[list(views)]),
+            focal_deviations=np.ascontiguousarray(self.focal_deviations[list(views)]),
+        )
+
+    def costs(self, labelling: Labelling) -> float:
+        """What a labelling costs before it is solved."""
+        options = self.options
+        total = options.missing_cost * len(labelling.absent)
+        absent = (
+            frozenset(position_of(t) for t in labelling.absent if is_upper(t)),
+            frozenset(position_of(t) for t in labelling.absent if not is_upper(t)),
+        )
+        for view, labels in zip(labelling.views, labelling.labels, strict=True):
+            total += options.unused_cost * self.cache.unused(view, labels)
+            total += options.defect_cost * sum(row_defects(labels[j], absent[j]) for j in (0, 1))
+        if len(self.rows) == 3 and options.order is None:
+            total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
+        return total
+
+    def solve(
+        self,
+        labelling: Labelling,
+        start: tuple[Array, Array] | None = None,
+        max_steps: int = FINAL_STEPS,
+        matches: Matches = NO_MATCHES,
+    ) -> Scored:
+        """Solve and score one labelling."""
+        adjusted = adjust(
+            self.cache.collect(list(labelling.views), list(labelling.labels)),
+            textbook_arch(labelling.closed),
+            self.priors(labelling.views, labelling.roles),
+            self.options.landmark_deviation,
+            matches=matches,
+            start=start,
+            max_steps=max_steps,
+            tolerance=0.05 if max_steps < FINAL_STEPS else 0.005,
+        )
+        self.solved += 1
+        return Scored(labelling, adjusted, adjusted.evidence + self.costs(labelling))
+
+    def solve_all(
+        self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int
+    ) -> list[Scored]:
+        """Solve labellings, on several threads, in the order given."""
+        for labelling, _ in jobs:
+            for view, labels in zip(labelling.views, labelling.labels, strict=True):
+                self.cache.unused(view, labels)  # fill the cache before threads share it
+        if self.threads < 2 or len(jobs) < 2:
+            return [self.solve(labelling, start, max_steps) for labelling, start in jobs]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(lambda job: self.solve(job[0], job[1], max_steps), jobs))
+
+
+def roles_of_view(view: int, views: int, options: ArchOptions) -> tuple[str, ...]:
+    """Roles that a photograph may have."""
+    if options.order is not None:
+        role = options.order[view]
+        return BETWEEN_ROLES if role == "between" else (role,)
+    return MAIN_ROLES if views <= 3 else MAIN_ROLES + BETWEEN_ROLES
+
+
+def row_pairs(rows: tuple[SeenRow, SeenRow]) -> list[ViewLabels]:
+    """Labels of both rows of a view, without gaps, that anatomy allows."""
+    upper, lower = rows
+    pairs = []
+    n, m = len(upper), len(lower)
+    upper_x, lower_x = upper.middles[:, 0], lower.middles[:, 0]
+    left, right = max(upper_x[0], lower_x[0]), min(upper_x[-1], lower_x[-1])
+    across = np.linspace(left, right, 9) if right > left else np.array([(left + right) / 2])
+    upper_at = np.interp(across, upper_x, np.arange(n))
+    lower_at = np.interp(across, lower_x, np.arange(m))
+    for first_upper in range(-1, POSITIONS - n + 2):
+        for first_lower in range(-1, POSITIONS - m + 2):
+            shift = (first_upper + upper_at) - (first_lower + lower_at)
+            if abs(float(shift.mean())) <= MAX_JAW_SHIFT:
+                pairs.append((contiguous(first_upper, n), contiguous(first_lower, m)))
+    return pairs
+
+
+def view_candidates(
+    scorer: Scorer, view: int, roles: tuple[str, ...], fixed: dict[tuple[int, int, int], int]
+) -> list[Scored]:
+    """The labellings of one photograph alone that are worth a look, best first.
+
+    Args:
+        scorer: of all photographs.
+        view: which.
+        roles: that it may have.
+        fixed: (view, jaw, crown) -> position, where a person has said it.
+    """
+    pairs = [
+        labels
+        for labels in row_pairs(scorer.rows[view])
+        if all(
+            labels[jaw][crown] == position
+            for (v, jaw, crown), position in fixed.items()
+            if v == view
+        )
+    ]
+    kept: list[Scored] = []
+    for role in roles:
+        jobs = [(Labelling((view,), (role,), (labels,)), None) for labels in pairs]
+        solved = sorted(scorer.solve_all(list(jobs), VIEW_STEPS), key=_order)
+        kept += solved[: scorer.options.candidates_per_view]
+    kept.sort(key=_order)
+    return [scored for scored in kept if scored.score < kept[0].score + VIEW_WINDOW]
+
+
+def _order(scored: Scored) -> tuple[float, tuple[ViewLabels, ...], tuple[str, ...]]:
+    """Sort key that never ties by chance."""
+    return (scored.score, scored.labelling.labels, scored.labelling.roles)
+
+
+def join(state: Scored, candidate: Scored) -> tuple[Labelling, tuple[Array, Array]]:
+    """A partial labelling and a candidate of one more view: the joint one, and where to start."""
+    a, b = state.labelling, candidate.labelling
+    labelling = replace(
+        a, views=a.views + b.views, roles=a.roles + b.roles, labels=a.labels + b.labels
+    )
+    unknowns = np.concatenate(
+        [
+            state.adjusted.unknowns[:-PER_ARCH],
+            candidate.adjusted.unknowns[:PER_VIEW],
+            state.adjusted.unknowns[-PER_ARCH:],
+        ]
+    )
+    return labelling, (unknowns, state.adjusted.offsets)
+
+
+def sort_views(scored: Scored) -> tuple[Labelling, tuple[Array, Array]]:
+    """The same labelling with its views in file order, and where to start."""
+    labelling = scored.labelling
+    order = sorted(range(len(labelling.views)), key=lambda k: labelling.views[k])
+    cameras = scored.adjusted.unknowns[:-PER_ARCH].reshape(-1, PER_VIEW)[order]
+    return (
+        replace(
+            labelling,
+            views=tuple(labelling.views[k] for k in order),
+            roles=tuple(labelling.roles[k] for k in order),
+            labels=tuple(labelling.labels[k] for k in order),
+        ),
+        (
+            np.concatenate([cameras.ravel(), scored.adjusted.unknowns[-PER_ARCH:]]),
+            scored.adjusted.offsets,
+        ),
+    )
+
+
+def search(scorer: Scorer, candidates: dict[int, list[Scored]]) -> list[Scored]:
+    """Joint labellings of all views, best first, by a beam over views.
+
+    Args:
+        scorer: of all photographs.
+        candidates: of each view that takes part, from `view_candidates`.
+
+    Returns:
+        At most `options.beam`, their views in file order.
+    """
+    beam = scorer.options.beam
+
+    def clarity(view: int) -> tuple[float, int]:
+        mine = candidates[view]
+        others = [s.score for s in mine if s.labelling.labels != mine[0].labelling.labels]
+        return (-(min(others) - mine[0].score) if others else -np.inf, view)
+
+    order = sorted(candidates, key=clarity)
+    states = candidates[order[0]]
+    for view in order[1:]:
+        mine = candidates[view]
+        repeated = len(scorer.rows) == 3 and scorer.options.order is None
+        pairs = sorted(
+            (
+                state.score
+                + candidate.score
+                + REPEATED_ROLE_COST
+                * (repeated and candidate.labelling.roles[0] in state.labelling.roles),
+                i,
+                j,
+            )
+            for i, state in enumerate(states)
+            for j, candidate in enumerate(mine)
+        )[:PAIRS_A_STEP]
+        jobs = [join(states[i], mine[j]) for _, i, j in pairs]
+        solved = sorted(scorer.solve_all(list(jobs), SEARCH_STEPS), key=_order)
+        states = solved[: 2 * beam]
+    finished = [sort_views(state) for state in states[:beam]]
+    return sorted(scorer.solve_all(list(finished), FINAL_STEPS), key=_order)

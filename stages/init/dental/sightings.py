@@ -1,0 +1,232 @@
+"""From the crowns of a photograph and their labels to landmarks seen.
+
+A label here is a position along the row, 0 (patient's right second molar) to 13, or `NO_TOOTH`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.anatomy import Jaw
+from stages.init.dental.bundle import Sightings
+from stages.init.dental.observation import Dentition, Point
+from stages.init.dental.template import (
+    EMBRASURE,
+    PAPILLA,
+    POSITIONS,
+    TIP,
+    ZENITH,
+    landmark_index,
+)
+
+Array = npt.NDArray[np.float64]
+Labels = tuple[int, ...]
+
+NO_TOOTH = -1
+JAWS: tuple[Jaw, Jaw] = ("upper", "lower")
+#: How well landmarks are found, as shares of the band of teeth (about 15 mm), across x along the
+#: row; a zenith or tip is in addition uncertain along the row by a share of its crown's width.
+ZENITH_DEVIATION, ZENITH_OF_WIDTH = (0.018, 0.018), 0.10
+TIP_DEVIATION, TIP_OF_WIDTH = (0.018, 0.024), 0.12
+PAPILLA_DEVIATION = (0.024, 0.029)
+EMBRASURE_DEVIATION = (0.035, 0.041)
+#: A papilla beside a doubtful crown is this much less certain; likewise one beside a gap.
+DOUBTFUL_FACTOR = 3.0
+GAP_FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class SeenRow:
+    """One row of crowns: landmarks in pixels about the principal point, the roll taken out.
+
+    Attributes:
+        jaw: upper or lower.
+        middles: [n, 2] between zenith and tip.
+        widths: [n] pixels.
+        band: height of the band of teeth, pixels.
+        zeniths, tips: [n, 2]; nan where not to be relied on.
+        papillae_left, papillae_right, embrasures_left, embrasures_right: [n, 2]; nan where none.
+        doubtful: [n] bool.
+        ends: [n] bool, where the row is cut off.
+    """
+
+    jaw: Jaw
+    middles: Array
+    widths: Array
+    band: float
+    zeniths: Array
+    tips: Array
+    papillae_left: Array
+    papillae_right: Array
+    embrasures_left: Array
+    embrasures_right: Array
+    doubtful: npt.NDArray[np.bool_]
+    ends: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.widths)
+
+    @cached_property
+    def landmark_count(self) -> int:
+        """How many landmarks the row offers to a labelling without gaps."""
+        return len(row_landmarks(self, tuple(range(len(self))), bounded=False)[0])
+
+
+def upright(points: Array, roll: float, width: int, height: int) -> Array:
+    """[N, 2] pixels of the image to pixels about its centre with the roll taken out."""
+    centred = points - np.array([width / 2, height / 2])
+    c, s = np.cos(roll), np.sin(roll)
+    return np.asarray(centred @ np.array([[c, -s], [s, c]]))
+
+
+def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
+    """The upper and the lower row of a photograph."""
+    height, width = dentition.mask.shape
+    rows = []
+    for jaw in JAWS:
+        crowns = dentition.crowns(jaw)
+
+        def collect(points: list[Point | None]) -> Array:
+            array = np.array(
+                [(np.nan, np.nan) if p is None else p for p in points], np.float64
+            ).reshape(-1, 2)
+            return upright(array, dentition.roll, width, height)
+
+        doubtful = np.array([crown.doubtful for crown in crowns], bool)
+        ends = np.array([crown.cut_left or crown.cut_right for crown in crowns], bool)
+        zeniths = collect([crown.zenith for crown in crowns])
+        tips = collect([crown.tip for crown in crowns])
+        middles = (zeniths + tips) / 2
+        weak = doubtful | ends
+        zeniths[weak] = np.nan
+        tips[weak] = np.nan
+        if jaw == "lower":
+            # The upper crowns overlap the lower ones' edges.
+            tips[:] = np.nan
+        hidden = np.full((len(crowns), 2), np.nan)
+        upper = jaw == "upper"
+        rows.append(
+            SeenRow(
+                jaw=jaw,
+                middles=middles,
+                widths=np.array([crown.width for crown in crowns], np.float64),
+                band=float(dentition.band_height),
+                zeniths=zeniths,
+                tips=tips,
+                papillae_left=collect([crown.papilla_left for crown in crowns]),
+                papillae_right=collect([crown.papilla_right for crown in crowns]),
+                embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
+                embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
+                doubtful=doubtful,
+                ends=ends,
+            )
+        )
+    return rows[0], rows[1]
+
+
+def row_landmarks(
+    row: SeenRow, labels: Labels, bounded: bool = True
+) -> tuple[list[int], list[tuple[float, float, float, float]]]:
+    """Landmark indices and (x, y, deviation x, deviation y) that a row shows under its labels.
+
+    Args:
+        row: the row of crowns.
+        labels: position of each crown, or `NO_TOOTH`.
+        bounded: False counts positions beyond the row's end too (to know how many there could be).
+    """
+    indices: list[int] = []
+    values: list[tuple[float, float, float, float]] = []
+    last = POSITIONS if bounded else 10 * POSITIONS
+
+    def add(
+        kind: int,
+        position: int,
+        point: Array,
+        size: tuple[float, float],
+        along: float,
+        factor: float,
+    ) -> None:
+        if np.isnan(point[0]):
+            return
+        indices.append(landmark_index(row.jaw, kind, position))
+        values.append(
+            (
+                float(point[0]),
+                float(point[1]),
+                factor * (size[0] * row.band + along),
+                factor * size[1] * row.band,
+            )
+        )
+
+    count = len(row)
+    for i, label in enumerate(labels):
+        if label == NO_TOOTH or not 0 <= label < last:
+            continue
+        width = float(row.widths[i])
+        add(ZENITH, label, row.zeniths[i], ZENITH_DEVIATION, ZENITH_OF_WIDTH * width, 1.0)
+        add(TIP, label, row.tips[i], TIP_DEVIATION, TIP_OF_WIDTH * width, 1.0)
+        if label + 1 < last:
+            following = labels[i + 1] if i + 1 < count else NO_TOOTH
+            factor = _factor(row, i, i + 1, following in (label + 1, NO_TOOTH))
+            add(PAPILLA, label, row.papillae_right[i], PAPILLA_DEVIATION, 0.0, factor)
+            add(EMBRASURE, label, row.embrasures_right[i], EMBRASURE_DEVIATION, 0.0, factor)
+        preceding = labels[i - 1] if i > 0 else NO_TOOTH
+        if label >= 1 and preceding != label - 1 and i > 0:
+            # Its left papilla is not the right one of the crown before: a gap, or that is none.
+            factor = _factor(row, i, i - 1, preceding == NO_TOOTH)
+            add(PAPILLA, label - 1, row.papillae_left[i], PAPILLA_DEVIATION, 0.0, factor)
+            add(EMBRASURE, label - 1, row.embrasures_left[i], EMBRASURE_DEVIATION, 0.0, factor)
+    return indices, values
+
+
+def _factor(row: SeenRow, own: int, neighbour: int, adjoining: bool) -> float:
+    """How much less certain a papilla is that two crowns share."""
+    doubtful = row.doubtful[own] or (0 <= neighbour < len(row) and row.doubtful[neighbour])
+    return (DOUBTFUL_FACTOR if doubtful else 1.0) * (1.0 if adjoining else GAP_FACTOR)
+
+
+class SightingCache:
+    """Sightings of labelled rows; the same rows come back many times in a search."""
+
+    def __init__(self, rows: list[tuple[SeenRow, SeenRow]]) -> None:
+        self.rows = rows
+        self._known: dict[tuple[int, int, Labels], tuple[npt.NDArray[np.int64], Array]] = {}
+
+    def of_row(self, view: int, jaw: int, labels: Labels) -> tuple[npt.NDArray[np.int64], Array]:
+        """Landmarks [K] and x, y, deviations [K, 4] of one row."""
+        key = (view, jaw, labels)
+        if key not in self._known:
+            indices, values = row_landmarks(self.rows[view][jaw], labels)
+            self._known[key] = (
+                np.array(indices, np.int64),
+                np.array(values, np.float64).reshape(-1, 4),
+            )
+        return self._known[key]
+
+    def unused(self, view: int, labels: tuple[Labels, Labels]) -> int:
+        """How many landmarks of a view its labels leave without a name."""
+        return sum(
+            max(
+                self.rows[view][jaw].landmark_count - len(self.of_row(view, jaw, labels[jaw])[0]), 0
+            )
+            for jaw in (0, 1)
+        )
+
+    def collect(self, views: list[int], labels: list[tuple[Labels, Labels]]) -> Sightings:
+        """Sightings of some views under their labels; views are numbered as in `views`."""
+        parts = [
+            (number, *self.of_row(view, jaw, labels[number][jaw]))
+            for number, view in enumerate(views)
+            for jaw in (0, 1)
+        ]
+        values = np.concatenate([part[2] for part in parts])
+        return Sightings(
+            view=np.concatenate([np.full(len(part[1]), part[0], np.int64) for part in parts]),
+            landmark=np.concatenate([part[1] for part in parts]),
+            pixels=np.ascontiguousarray(values[:, :2]),
+            deviations=np.ascontiguousarray(values[:, 2:]),
+        )

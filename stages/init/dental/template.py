@@ -1,0 +1,167 @@
+"""The textbook arch: where the landmarks of 28 teeth of textbook size lie on a smooth arch.
+
+Real patients differ from it by about 1.5 mm RMS after the nine stretches that `bundle` fits.
+Frame: x to the patient's left, y up, z to the front, millimetres; the origin lies between the upper
+central incisors' biting edges.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.init.dental.anatomy import Jaw, Landmark, is_upper, teeth_of
+
+Array = npt.NDArray[np.float64]
+
+#: Mesiodistal widths and visible crown heights, from central incisor to second molar (mm; Wheeler's
+#: dental anatomy, tables of tooth measurements; gum covers some of the height).
+WIDTHS: dict[Jaw, tuple[float, ...]] = {
+    "upper": (8.5, 6.5, 7.6, 7.0, 6.8, 10.0, 9.0),
+    "lower": (5.2, 5.7, 6.9, 7.0, 7.1, 11.0, 10.5),
+}
+HEIGHTS: dict[Jaw, tuple[float, ...]] = {
+    "upper": (9.6, 8.2, 9.0, 7.6, 6.8, 6.2, 5.5),
+    "lower": (8.2, 8.4, 9.3, 8.0, 7.0, 6.6, 5.8),
+}
+#: Half width and depth of each arch's curve (mm).
+ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (30.5, 46.0), "lower": (28.0, 43.0)}
+#: How far the lower incisors reach up behind the upper ones, and lie behind them (mm).
+OVERBITE, OVERJET = 2.5, 2.2
+#: Teeth a side, without wisdom teeth.
+TEETH_A_SIDE = 7
+#: Positions along a row, patient's right to left; the midline is between 6 and 7.
+POSITIONS = 14
+
+
+def tooth_at(jaw: Jaw, position: int) -> int:
+    """FDI number of a position along the row (0: the patient's right second molar)."""
+    return teeth_of(jaw)[position]
+
+
+def position_of(tooth: int) -> int:
+    """Position along its row of the tooth with an FDI number."""
+    return teeth_of("upper" if is_upper(tooth) else "lower").index(tooth)
+
+
+@lru_cache(maxsize=1)
+def landmark_names() -> tuple[Landmark, ...]:
+    """All landmarks of the model, jaw by jaw: zeniths, tips, papillae, embrasures by position."""
+    names: list[Landmark] = []
+    jaws: tuple[Jaw, Jaw] = ("upper", "lower")
+    for jaw in jaws:
+        teeth = teeth_of(jaw)
+        names += [Landmark("zenith", tooth) for tooth in teeth]
+        names += [Landmark("tip", tooth) for tooth in teeth]
+        names += [Landmark("papilla", a, b) for a, b in pairwise(teeth)]
+        names += [Landmark("embrasure", a, b) for a, b in pairwise(teeth)]
+    return tuple(names)
+
+
+#: Where each kind starts in a jaw's part of `landmark_names`, and how many a jaw has.
+ZENITH, TIP, PAPILLA, EMBRASURE = 0, POSITIONS, 2 * POSITIONS, 3 * POSITIONS - 1
+LANDMARKS_A_JAW = 4 * POSITIONS - 2
+
+
+def landmark_index(jaw: Jaw, kind_start: int, position: int) -> int:
+    """Index into `landmark_names` of a kind (`ZENITH`, ...) at a position (or right of a gap)."""
+    return (0 if jaw == "upper" else LANDMARKS_A_JAW) + kind_start + position
+
+
+def is_lower_landmark() -> npt.NDArray[np.bool_]:
+    """[L] bool: which landmarks of `landmark_names` belong to the lower jaw."""
+    return np.arange(2 * LANDMARKS_A_JAW) >= LANDMARKS_A_JAW
+
+
+def _arch_curve(half_width: float, depth: float, length: float) -> tuple[Array, Array, Array]:
+    """Arc length, x and z of half an arch from the midline backwards, [4000] each."""
+    t = np.linspace(0.0, np.pi / 2, 4000)
+    x = half_width * np.sin(t) ** 0.9
+    z = -depth * (1 - np.cos(t) ** 1.15)
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
+    return arc * (length / arc[-1]), x, z
+
+
+def _half_jaw(jaw: Jaw, absent: frozenset[int]) -> Array:
+    """Landmarks of a jaw's left half: [4, 8, 3] by kind and position from the midline.
+
+    Of papillae and embrasures, position i is the mesial one of tooth i.
+    """
+    upper = jaw == "upper"
+    widths = np.array([0.0 if i in absent else w for i, w in enumerate(WIDTHS[jaw])])
+    heights = np.array(HEIGHTS[jaw])
+    arc, x, z = _arch_curve(*ARCH_SIZE[jaw], float(sum(WIDTHS[jaw])))
+    borders = np.concatenate([[0.0], np.cumsum(widths)])
+    towards_gum = 1.0 if upper else -1.0
+
+    def on_arch(s: float) -> Array:
+        return np.array([np.interp(s, arc, x), 0.0, np.interp(s, arc, z)])
+
+    def outward(s: float) -> Array:
+        along = on_arch(s + 0.5) - on_arch(max(s - 0.5, 0.0))
+        along /= np.linalg.norm(along)
+        return np.array([-along[2], 0.0, along[0]])
+
+    def lift(tooth: int) -> float:
+        """Height of the biting edge: the lower incisors overlap; both rows rise to the back."""
+        bite = 0.0 if upper else OVERBITE * (1 - 0.12 * tooth)
+        return bite + 0.2 * max(0, tooth - 2)
+
+    back = np.array([0.0, 0.0, 0.0 if upper else -OVERJET])
+    points = np.zeros((4, TEETH_A_SIDE, 3))
+    for i in range(TEETH_A_SIDE):
+        middle = float(borders[i] + borders[i + 1]) / 2
+        base, normal = on_arch(middle) + back, outward(middle)
+        cusp = -0.4 * towards_gum if i == 2 else 0.0
+        inward = 0.8 if i < 3 else 1.8
+        points[0, i] = base - normal + [0, towards_gum * heights[i] + lift(i), 0]
+        points[1, i] = base - inward * normal + [0, lift(i) + cusp, 0]
+        base, normal = on_arch(float(borders[i])) + back, outward(float(borders[i]))
+        if i == 0:
+            height, inset = heights[0], np.array([0.0, 0.0, 1.0])
+            depths, shares, level = (1.5, 1.2), (0.5, 0.2), lift(0)
+        else:
+            height, inset = (heights[i - 1] + heights[i]) / 2, normal
+            depths, shares, level = (2.2, 2.0), (0.55, 0.22), lift(i - 1)
+        for kind in (0, 1):
+            up = towards_gum * shares[kind] * height + level
+            points[2 + kind, i] = base - depths[kind] * inset + [0, up, 0]
+    return points
+
+
+@lru_cache(maxsize=128)
+def textbook_arch(closed_gaps: frozenset[int] = frozenset()) -> Array:
+    """Positions of all landmarks of `landmark_names` on the textbook arch.
+
+    Args:
+        closed_gaps: FDI numbers of teeth that are missing and whose space the teeth behind have
+            closed. Their landmarks are placed where the neighbours meet.
+
+    Returns:
+        [L, 3] float64, mm, arch frame. Not to be written to (it is cached).
+    """
+    result = np.empty((2 * LANDMARKS_A_JAW, 3))
+    jaws: tuple[Jaw, Jaw] = ("upper", "lower")
+    for jaw in jaws:
+        for side in (1, -1):
+            absent = frozenset(
+                (position - 7 if side == 1 else 6 - position)
+                for position in (
+                    position_of(t) for t in closed_gaps if is_upper(t) == (jaw == "upper")
+                )
+                if (position >= 7) == (side == 1)
+            )
+            half = _half_jaw(jaw, absent) * np.array([side, 1, 1])
+            for i in range(TEETH_A_SIDE):
+                position = 7 + i if side == 1 else 6 - i
+                result[landmark_index(jaw, ZENITH, position)] = half[0, i]
+                result[landmark_index(jaw, TIP, position)] = half[1, i]
+                # A gap is named by the position on its (patient's) right.
+                gap = 6 + i if side == 1 else 6 - i
+                result[landmark_index(jaw, PAPILLA, gap)] = half[2, i]
+                result[landmark_index(jaw, EMBRASURE, gap)] = half[3, i]
+    result.flags.writeable = False
+    return result

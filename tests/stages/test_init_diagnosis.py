@@ -1,0 +1,80 @@
+"""What is said of photographs that could not be placed."""
+
+import numpy as np
+
+from stages.init.classical import Attempt, Evidence
+from stages.init.diagnosis import Limits, failure, warnings_of
+from stages.init.geometry import TwoView
+from stages.init.mapping import Solution
+
+NAMES = ["right.jpg", "front.jpg", "left.jpg"]
+
+
+def two_view(inliers, coherence=0.9):
+    pose = np.hstack([np.eye(3), [[1.0], [0], [0]]])
+    return TwoView(500, np.arange(inliers), coherence, pose)
+
+
+def evidence(keypoints=(900, 900, 900), edges=None, linked=()):
+    matches = {(0, 1): 500, (0, 2): 100, (1, 2): 400}
+    displacement = dict.fromkeys(matches, 20.0)
+    return Evidence(list(keypoints), matches, displacement, edges or {}, tuple(linked))
+
+
+def solution(views):
+    return Solution(
+        {view: np.eye(4) for view in views}, dict.fromkeys(views, 500.0), np.zeros((1, 3)),
+        np.zeros(1, int), np.zeros(1, int), np.zeros((1, 2)), np.zeros(1),
+    )  # fmt: skip
+
+
+def test_all_placed_and_determined_needs_no_word():
+    assert warnings_of(Attempt(solution([0, 1, 2]), evidence(), True, True), NAMES) == []
+
+
+def test_an_unplaced_photograph_is_named_with_its_best_match():
+    edges = {(0, 1): two_view(200), (1, 2): two_view(40, 0.3), (0, 2): two_view(30, 0.2)}
+    (text,) = warnings_of(
+        Attempt(solution([0, 1]), evidence(edges=edges, linked=[(0, 1)]), True, True), NAMES
+    )
+    assert "1 of 3 photographs" in text
+    assert "'front.jpg' and 'left.jpg' share too little: 400 spots" in text
+    assert "40 (10 %)" in text
+    assert "more than 35 degrees" in text
+    assert "no more than 20 degrees" in text
+
+
+def test_a_blurred_photograph_is_called_so():
+    blurred = evidence(keypoints=(900, 900, 120))
+    (text,) = warnings_of(Attempt(solution([0, 1]), blurred, True, True), NAMES)
+    assert "'left.jpg' shows only 120 distinct spots where the others show 900" in text
+
+
+def test_a_photograph_that_contradicts_the_others_is_called_so():
+    edges = {(0, 1): two_view(200), (1, 2): two_view(150)}
+    found = evidence(edges=edges, linked=[(0, 1), (1, 2)])
+    (text,) = warnings_of(Attempt(solution([0, 1]), found, True, True), NAMES)
+    assert "'left.jpg' matches 'front.jpg' (150 spots agree), but contradicts" in text
+
+
+def test_an_undetermined_focal_length_says_what_to_do():
+    (text,) = warnings_of(Attempt(solution([0, 1, 2]), evidence(), False, False), NAMES)
+    assert "undetermined" in text
+    assert "EXIF" in text
+    assert "init.focal" in text
+
+
+def test_every_gap_is_named():
+    edges = {(0, 1): two_view(30, 0.3), (1, 2): two_view(20, 0.3)}
+    text = failure(Attempt(None, evidence(edges=edges), True, False), NAMES, Limits(3, 2.0))
+    assert "'right.jpg' and 'front.jpg' share too little: 500 spots" in text
+    assert "'front.jpg' and 'left.jpg' share too little: 400 spots" in text
+    assert "'right.jpg' and 'left.jpg'" not in text
+    assert "init.focal" not in text  # it is known
+
+
+def test_linked_photographs_without_a_solution_contradict_each_other():
+    edges = {(0, 1): two_view(200), (1, 2): two_view(150)}
+    found = evidence(edges=edges, linked=[(0, 1), (1, 2)])
+    text = failure(Attempt(None, found, False, False), NAMES, Limits(3, 2.0))
+    assert "contradict each other" in text

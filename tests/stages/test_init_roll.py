@@ -1,0 +1,91 @@
+"""Rolled photographs: the angle, and features of the photograph turned back."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.init.features import detect_features, turned_back
+from stages.init.geometry import unrolled
+from stages.init.matching import match_features
+from stages.init.roll import find_rolls, groups, relative_roll
+
+
+def texture(seed=0, size=(200, 260)):
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.normal(0, 1, size), (0, 0), s) * s for s in (1, 2, 4))
+    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)
+
+
+def clockwise(gray, degrees):
+    """The picture that a camera rolled the other way takes: turned clockwise on its canvas."""
+    return turned_back(gray, -degrees)
+
+
+def everywhere(gray):
+    return np.ones(gray.shape, bool)
+
+
+def silent(*_):
+    pass
+
+
+def test_a_quarter_turn_is_that_of_the_pixel_grid():
+    gray = texture(size=(30, 40))
+    turned, original_from_turned = turned_back(gray, 90)
+    np.testing.assert_array_equal(turned, np.rot90(gray, 1))  # back: anticlockwise
+    # The first pixel of the turned image is the last of the first row.
+    first = original_from_turned[:, :2] @ (0.5, 0.5) + original_from_turned[:, 2]
+    np.testing.assert_allclose(first, [39.5, 0.5])
+
+
+def test_unrolled_positions_move_as_the_picture_does():
+    back = unrolled(np.array([[0.0, 1.0]]), 90)  # below the corner; anticlockwise: to its right
+    np.testing.assert_allclose(back, [[1.0, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [40.0, 90.0])
+def test_a_rolled_photograph_is_noticed_and_matched(degrees):
+    gray = texture()
+    rolled, gray_from_rolled = clockwise(gray, degrees)
+    rolls = find_rolls(
+        [gray, rolled], [everywhere(gray), everywhere(rolled)], [], 0.002, 1.0, 1, silent
+    )
+    assert rolls[0] == 0
+    difference = (rolls[1] - degrees + 180) % 360 - 180
+    assert abs(difference) < 5
+    first = detect_features(gray, everywhere(gray), squeezes=(1.0,))
+    for roll, least, most in ((0.0, 0, 0.2), (rolls[1], 0.8, 1)):
+        second = detect_features(rolled, everywhere(rolled), squeezes=(1.0,), roll=roll)
+        assert second.roll == roll
+        found = match_features(first, second)
+        places = second.positions[found[:, 1]] @ gray_from_rolled[:, :2].T + gray_from_rolled[:, 2]
+        apart = np.linalg.norm(places - first.positions[found[:, 0]], axis=1)
+        right = (apart < 1.5).sum() / len(first)
+        assert least <= right * 2 if least else right < most
+        if least:
+            assert np.median(apart[apart < 3]) < 0.3
+
+
+def test_linked_photographs_are_left_alone():
+    grays = [texture(), clockwise(texture(), 90)[0]]
+    valid = [everywhere(gray) for gray in grays]
+    assert find_rolls(grays, valid, [(0, 1)], 0.002, 1.0, 1, silent) == [0.0, 0.0]
+
+
+def test_strangers_have_no_roll_and_threads_change_nothing():
+    grays = [texture(0), texture(1), clockwise(texture(0), 60)[0]]
+    valid = [everywhere(gray) for gray in grays]
+    one, two = (find_rolls(grays, valid, [], 0.002, 1.0, n, silent) for n in (1, 2))
+    assert one == two
+    assert one[:2] == [0.0, 0.0]
+    assert abs(one[2] - 60) < 5
+
+
+def test_no_matches_say_nothing():
+    none = np.zeros((0, 2))
+    assert relative_roll(none, none, np.zeros(0), 40.0).votes == 0
+
+
+def test_groups_follow_the_links():
+    assert groups([(1, 2), (2, 4)], 5) == [0, 1, 1, 3, 1]
+    assert groups([], 2) == [0, 1]
