@@ -31,8 +31,10 @@ def normalising_similarity(
         down = cameras[0].rotation[1]
     down = down / np.linalg.norm(down)
     ahead = ahead - (ahead @ down) * down
-    if np.linalg.norm(ahead) < 1e-3:
+    if np.linalg.norm(ahead) < 1e-3:  # cameras all around: the first one decides
         ahead = cameras[0].rotation[2] - (cameras[0].rotation[2] @ down) * down
+    if np.linalg.norm(ahead) < 1e-6:  # it looks straight down
+        ahead = cameras[0].rotation[0] - (cameras[0].rotation[0] @ down) * down
     ahead = ahead / np.linalg.norm(ahead)
     rotation = np.stack([np.cross(down, ahead), down, ahead])
     # The median goes by axis, so it is taken along the new ones.

@@ -25,7 +25,10 @@ POINTMAPS = PointmapOptions()
 class DenseConfig(StageConfig):
     """Dense stereo."""
 
-    method: Literal["sweep"] = Field("sweep", description="plane sweep with semi-global matching")
+    method: Literal["sweep", "sgbm"] = Field(
+        "sweep",
+        description="plane sweep with semi-global matching; sgbm: a quick preview for near views",
+    )
     planes: int = Field(
         DENSE.planes, ge=8, le=512, description="least number of depths tried per pixel"
     )

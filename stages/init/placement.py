@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
+from stages.geometry.world import move_camera, normalising_similarity
 from stages.init.geometry import Pair
-from stages.init.normalise import moved_points, moved_pose, world_similarity
 
 Array = npt.NDArray[np.float64]
 
@@ -40,25 +40,18 @@ class Placement:
     figures: dict[str, float | int | str] = field(default_factory=dict)
 
     def normalised(self) -> Placement:
-        """The same in a world that is centred, scaled and upright (`world_similarity`).
+        """The same in a world that is centred, scaled and upright (`normalising_similarity`).
 
         `input_from_world` still leads to the same frame.
         """
-        scale, rotation, centre = world_similarity(
-            [camera.cam_from_world for camera in self.cameras], self.points
-        )
+        motion = normalising_similarity(self.cameras, self.points)
+        scale, rotation, shift = motion
         old_from_new = np.eye(4)
         old_from_new[:3, :3] = rotation.T / scale
-        old_from_new[:3, 3] = centre
+        old_from_new[:3, 3] = -rotation.T @ shift / scale
         return replace(
             self,
-            cameras=tuple(
-                replace(
-                    camera,
-                    cam_from_world=moved_pose(camera.cam_from_world, scale, rotation, centre),
-                )
-                for camera in self.cameras
-            ),
-            points=moved_points(self.points, scale, rotation, centre),
+            cameras=tuple(move_camera(camera, motion) for camera in self.cameras),
+            points=scale * self.points @ rotation.T + shift,
             input_from_world=self.input_from_world @ old_from_new,
         )

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from stages.init.dense import DenseOptions, DenseView, dense_depths
-from stages.init.dense.appearance import highlights, normals_from_depth
+from stages.init.dense.appearance import highlights, normals_from_depth, to_gray
+from stages.init.dense.sgbm import sgbm_depth
 from stages.init.dense.sources import inverse_depth_range, scene_points, select_sources
 
 _spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
@@ -60,6 +61,38 @@ def test_depth_is_right_and_most_of_it_is_there(three):
         assert np.median(error) < 0.003
         assert np.percentile(error, 95) < 0.03
     assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_the_quick_preview_is_right_where_it_says_something():
+    cameras, images, depths, sparse = scene((-6.0, 0.0, 6.0))
+    quick = replace(OPTIONS, method="sgbm")
+    found = dense_depths(images, everywhere(images), cameras, sparse, quick, 2, lambda *_: None)
+    for view, truth in zip(found, depths, strict=True):
+        assert (view.depth > 0).mean() > 0.3
+        assert np.median(relative_error(view, truth)) < 0.012
+    again = dense_depths(images, everywhere(images), cameras, sparse, quick, 1, lambda *_: None)
+    assert same(found, again)
+
+
+def test_the_quick_preview_of_views_above_each_other():
+    """The scene turned by a quarter: rectified lines are columns."""
+    cameras, images, depths, _ = scene((-6.0, 6.0))
+    turn = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    upright = [
+        replace(
+            camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx,
+            cx=camera.cy, cy=camera.width - camera.cx, cam_from_world=turn @ camera.cam_from_world,
+        )
+        for camera in cameras
+    ]  # fmt: skip
+    grays = [to_gray(np.ascontiguousarray(np.rot90(image))) for image in images]
+    truth = np.rot90(depths[0])
+    all_of_it = np.ones(truth.shape, bool)
+    ends = (1 / truth.max(), 1 / truth.min())
+    found = sgbm_depth(grays[0], all_of_it, upright[0], grays[1], all_of_it, upright[1], ends, 5)
+    known = found > 0
+    assert known.mean() > 0.3
+    assert np.median(np.abs(found - truth)[known] / truth[known]) < 0.012
 
 
 def test_confidence_is_one_only_where_nothing_is_known_and_higher_where_depth_is_better(three):

@@ -9,13 +9,15 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float32]
 
+METHODS = ("sweep", "sgbm")
+
 
 @dataclass(frozen=True)
 class DenseOptions:
     """Settings of `dense_depths`.
 
     Attributes:
-        method: ``"sweep"`` (plane sweep), the only one.
+        method: ``"sweep"`` (plane sweep) or ``"sgbm"`` (rectified pairs: a quick preview).
         planes: least number of depth hypotheses per view.
         max_planes: most; between the two the step is `step_px` in the farthest source.
         max_volume: pixels times planes that one cost volume may have; two volumes of 4 bytes each

@@ -14,7 +14,8 @@ from stages.init.dense.aggregate import aggregate, decide, edge_aware_penalty
 from stages.init.dense.appearance import highlights, normals_from_depth, to_gray
 from stages.init.dense.consistency import camera_table, check, stack_depths
 from stages.init.dense.fill import complete, distance_to
-from stages.init.dense.options import DenseOptions, DenseView
+from stages.init.dense.options import METHODS, DenseOptions, DenseView
+from stages.init.dense.sgbm import ASSUMED_CORRELATION, sgbm_depth
 from stages.init.dense.sources import (
     inverse_depth_range,
     plane_count,
@@ -66,8 +67,8 @@ def dense_depths(
                 f"view {camera.name}: image {image.shape}, mask {mask.shape}, but the camera is "
                 f"{camera.width}x{camera.height}"
             )
-    if options.method != "sweep":
-        raise ValueError(f"unknown dense method '{options.method}'; there is 'sweep'")
+    if options.method not in METHODS:
+        raise ValueError(f"unknown dense method '{options.method}'; there are {METHODS}")
     before = numba.get_num_threads()
     available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     numba.set_num_threads(max(1, min(threads, available)))
@@ -100,9 +101,8 @@ def _dense_depths(
             index, cameras, points[index], options.sources,
             options.best_angle, options.min_angle, options.max_angle,
         )  # fmt: skip
-        depth, ncc = _sweep_view(
-            index, chosen, grays, usable, cameras, points[index], everything, options
-        )
+        find = _sweep_view if options.method == "sweep" else _sgbm_view
+        depth, ncc = find(index, chosen, grays, usable, cameras, points[index], everything, options)
         keep = valid[index] & (ncc > options.min_ncc)
         depths.append(np.where(keep, depth, 0).astype(np.float32))
         scores.append(ncc)
@@ -150,6 +150,39 @@ def _sweep_view(
     ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)
     return depth.astype(np.float32), ncc.astype(np.float32)
+
+
+def _sgbm_view(
+    index: int,
+    chosen: list[int],
+    grays: list[Array],
+    usable: list[Mask],
+    cameras: list[Camera],
+    points: npt.NDArray[np.float64],
+    everything: npt.NDArray[np.float64],
+    options: DenseOptions,
+) -> tuple[Array, Array]:
+    """As `_sweep_view`, from rectified pairs: the median of what the sources say."""
+    camera = cameras[index]
+    ends = inverse_depth_range(camera, points, everything, options.range_margin)
+    found = [
+        sgbm_depth(
+            grays[index], usable[index], camera, grays[k], usable[k], cameras[k],
+            (float(ends[0]), float(ends[1])), options.window,
+        )
+        for k in chosen
+    ]  # fmt: skip
+    if not found:
+        empty = np.zeros((camera.height, camera.width), np.float32)
+        return empty, empty
+    stack = np.stack(found)
+    stack.sort(axis=0)  # zeros first
+    count = (stack > 0).sum(0)
+    middle = len(found) - count + (count - 1) // 2
+    depth = np.take_along_axis(stack, np.clip(middle, 0, len(found) - 1)[None], 0)[0]
+    known = count > 0
+    score = np.where(known, np.float32(ASSUMED_CORRELATION), np.float32(-1))
+    return np.where(known, depth, 0).astype(np.float32), score.astype(np.float32)
 
 
 def _consistent(

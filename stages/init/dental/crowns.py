@@ -41,6 +41,7 @@ class CrownOptions:
         least_shoulder: the same once the climb of the gum line is taken out, where a dark line
             between the crowns agrees.
         least_width: narrower dips of the gum line are no crowns.
+        least_height: what is lower than this at the ends of a row is no crown.
         least_column: columns in which the band is lower than this share of its median are left out.
         narrow, wide: a crown is doubtful if its width is less or more than this many times what its
             neighbours suggest.
@@ -51,6 +52,7 @@ class CrownOptions:
     least_papilla: float = 0.035
     least_shoulder: float = 0.02
     least_width: float = 0.1
+    least_height: float = 0.05
     least_column: float = 0.35
     narrow: float = 0.5
     wide: float = 1.6
@@ -181,6 +183,7 @@ def _jaw_crowns(
         for left, right in pairwise(ends)
         if right - left >= options.least_width * band
     ]
+    stretches = _shown(stretches, sign * meet - gum, options.least_height * band)
     stretches = _split_wide(stretches, between, band, options)
     stretches = _marked(stretches, options)
     biting = (lowest if jaw == "upper" else -highest).astype(np.float64)
@@ -217,6 +220,19 @@ def _jaw_crowns(
             )
         )
     return tuple(crowns)
+
+
+def _shown(stretches: list[_Stretch], tallness: Profile, least: float) -> list[_Stretch]:
+    """Without what at the ends of the row is no crown: there the photograph shows the other jaw."""
+
+    def too_flat(stretch: _Stretch) -> bool:
+        return float(np.median(tallness[stretch.left : stretch.right + 1])) < least
+
+    while stretches and too_flat(stretches[0]):
+        stretches = stretches[1:]
+    while stretches and too_flat(stretches[-1]):
+        stretches = stretches[:-1]
+    return stretches
 
 
 def _papillae(gum: Profile, between: Profile, band: float, options: CrownOptions) -> list[int]:

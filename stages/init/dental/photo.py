@@ -47,6 +47,7 @@ class PhotoOptions:
             enamel is greener than gum (log units), and crowns in both jaws together.
         sure_photos: `teeth_likely` looks at so many photographs at most.
         uneven: doubts are raised when one jaw has more than this many times the other's crowns.
+        overexposed: a doubt is raised when this share of the middle of the photograph is white.
         mask: of the tooth mask.
         crowns: of the crowns.
     """
@@ -61,6 +62,7 @@ class PhotoOptions:
     sure_crowns: int = 7
     sure_photos: int = 5
     uneven: float = 1.6
+    overexposed: float = 0.06
     mask: MaskOptions = field(default_factory=MaskOptions)
     crowns: CrownOptions = field(default_factory=CrownOptions)
 
@@ -191,6 +193,12 @@ def _read(
     )
     upright_from_image = _chained(upright_from_analysis, analysis_from_image)
     dentition = _mapped_back(row, found, upright_from_image, roll, (height, width), options)
+    if channels.clipped > options.overexposed:
+        doubt = (
+            f"{channels.clipped:.0%} of the middle of the photograph is overexposed to white, "
+            "where enamel can't be told from gum and gloves"
+        )
+        dentition = replace(dentition, doubts=(*dentition.doubts, doubt))
     return dentition, found
 
 

@@ -21,6 +21,8 @@ Float = npt.NDArray[np.float32]
 LOG_FLOOR = 0.04
 #: Noise and JPEG blocks in the colour are smoothed by this (pixels): less than a gum line is sharp.
 GREENNESS_BLUR = 1.2
+#: A channel above this is saturated: an overexposed camera pixel is 254 or 255.
+SATURATED = 0.97
 #: Range and bins of the greenness histogram.
 GREENNESS_RANGE = (-2.0, 1.2)
 GREENNESS_BINS = 640
@@ -72,6 +74,7 @@ class Channels:
         greenness: see the module; highlights filled in.
         redness: log R/G.
         brightness: largest channel, 0..1.
+        clipped: share of the middle of the photograph in which all channels are saturated.
         highlight: True on highlights.
         valid: True where the photograph counts.
     """
@@ -82,6 +85,7 @@ class Channels:
     brightness: Float
     highlight: Bool
     valid: Bool
+    clipped: float
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,7 @@ def read_channels(image: Float, valid: Bool, options: MaskOptions) -> Channels:
     logs = np.log(colour + LOG_FLOOR)
     greenness = 2 * logs[..., 1] - logs[..., 0] - logs[..., 2]
     highlight = _highlights(colour, options)
+    weight = central_weight((image.shape[0], image.shape[1]), options)
     low, high = GREENNESS_RANGE
     coded = np.clip((greenness - low) / (high - low) * 255, 0, 255).astype(np.uint8)
     if highlight.any():
@@ -140,6 +145,7 @@ def read_channels(image: Float, valid: Bool, options: MaskOptions) -> Channels:
         brightness=colour.max(axis=-1),
         highlight=highlight,
         valid=valid,
+        clipped=float((weight * (colour.min(axis=-1) > SATURATED)).sum() / weight.sum()),
     )
 
 
@@ -319,7 +325,10 @@ def _parts_like_teeth(
     left, part_width = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_WIDTH]
     beside = (left + part_width <= left[main] + 2) | (left >= left[main] + part_width[main] - 2)
     between = (middle > top + 0.25 * (bottom - top)) & (middle < bottom - 0.25 * (bottom - top))
-    good &= beside | between | (part_width > 0.25 * part_width[main])
+    # (and tall: the blurred rim of a glove is a thin strip)
+    thickness = area / np.maximum(part_width, 1)
+    jaw = (part_width > 0.25 * part_width[main]) & (thickness > 0.25 * thickness[main])
+    good &= beside | between | jaw
     good[main] = True
     large = good & (area > 0.02 * area[main])
     share = float(touching[good].sum() / edge[good].sum())

@@ -1,0 +1,276 @@
+"""The dental path against the truth: labels, cameras, surface, seconds.
+
+    python benchmarks/dental.py --data DIR [--only 001,012,022] [--threads 2]
+
+DIR holds `scan_video_a/` (exact cameras, `teeth.ply`) and, where there is one, `dental_photos_a/`
+(cameras of reference only). Nothing here is known to the method: no focal length, no order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import open3d
+from scipy.spatial.transform import Rotation
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View
+from pipeline.errors import ReconstructionError
+from stages.init.dental.anatomy import teeth_of
+from stages.init.dental.arch_options import ArchOptions
+from stages.init.dental.observation import Dentition
+from stages.init.dental.photo import PhotoOptions
+from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
+from stages.init.dental.solution import PlacedView
+from stages.init.dental.surface_options import SurfaceOptions
+
+Array = npt.NDArray[np.float64]
+
+TRIPLES = (
+    "001,012,022", "005,012,018", "004,011,019", "003,011,020", "002,011,021", "000,012,023",
+    "005,012,023", "000,011,018", "001,009,020", "003,014,022",
+)  # fmt: skip
+PHOTOS = "0_right,1_frontal,2_left"
+SIZE = (512, 384)
+#: Share of the pairs that an alignment is made of; the rest are outliers.
+KEPT = 85
+
+
+class Scan:
+    """The scanned crowns: which tooth a ray meets, and how far a point is from them."""
+
+    def __init__(self, path: Path) -> None:
+        mesh = open3d.io.read_triangle_mesh(str(path))
+        component, count, _ = mesh.cluster_connected_triangles()
+        component, vertices = np.asarray(component), np.asarray(mesh.vertices)
+        triangles = np.asarray(mesh.triangles)
+        large = [k for k, size in enumerate(count) if size > 300]
+        centres = np.array(
+            [vertices[np.unique(triangles[component == k])].mean(axis=0) for k in large]
+        )
+        self._tooth_of = np.zeros(component.max() + 1, np.int64)
+        above = centres[:, 1] > np.median(centres[:, 1])
+        for chosen, jaw in ((above, "upper"), (~above, "lower")):
+            mine = np.flatnonzero(chosen)
+            back = centres[mine, 2].min() - 5
+            angle = np.arctan2(centres[mine, 0] - centres[mine, 0].mean(), centres[mine, 2] - back)
+            for number, tooth in zip(mine[np.argsort(angle)], teeth_of(jaw), strict=True):
+                self._tooth_of[large[number]] = tooth
+        self._component = component
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            open3d.core.Tensor(vertices.astype(np.float32)),
+            open3d.core.Tensor(triangles.astype(np.uint32)),
+        )
+
+    def look(self, camera: Camera) -> tuple[npt.NDArray[np.int64], Array]:
+        """[H, W] FDI number (0: none) and [H, W, 3] point that each pixel sees."""
+        rays = self._scene.create_rays_pinhole(
+            open3d.core.Tensor(camera.matrix), open3d.core.Tensor(camera.cam_from_world),
+            camera.width, camera.height,
+        )  # fmt: skip
+        found = self._scene.cast_rays(rays, nthreads=1)
+        far, rays = found["t_hit"].numpy(), rays.numpy().astype(np.float64)
+        hit = np.isfinite(far)
+        tooth = np.zeros(far.shape, np.int64)
+        triangle = found["primitive_ids"].numpy()[hit].astype(np.int64)
+        tooth[hit] = self._tooth_of[self._component[triangle]]
+        return tooth, rays[..., :3] + rays[..., 3:] * np.where(hit, far, np.nan)[..., None]
+
+    def nearest(self, points: Array) -> Array:
+        """[N, 3] the nearest points of the scan."""
+        query = open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        found = self._scene.compute_closest_points(query, nthreads=1)["points"]
+        return np.asarray(found.numpy(), np.float64)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Photographs and their true (or reference) cameras."""
+
+    name: str
+    views: list[View]
+    cameras: list[Camera]
+
+
+def read_case(data: Path, names: str) -> Case:
+    """Photographs at working size."""
+    cameras, views = [], []
+    if names == PHOTOS:
+        frames = json.loads((data / "dental_photos_a/transforms_reference.json").read_text())
+    else:
+        frames = json.loads((data / "scan_video_a/transforms.json").read_text())
+    for number, name in enumerate(names.split(",")):
+        if names == PHOTOS:
+            frame = frames["frames"][name]
+            matrix = np.array(frame["K"]) / 2
+            image = cv2.imread(str(data / f"dental_photos_a/images/{name}.jpg"))
+        else:
+            frame = next(f for f in frames["frames"] if Path(f["file_path"]).stem == name)
+            focal = frames["fl_x"]
+            matrix = np.array([[focal, 0, frames["cx"]], [0, focal, frames["cy"]], [0, 0, 1]])
+            image = cv2.imread(str(data / "scan_video_a" / frame["file_path"]))
+        if image.shape[1::-1] != SIZE:
+            image = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+        pose = np.array(frame["w2c_opencv"])
+        pose = pose if len(pose) == 4 else np.vstack([pose, [0, 0, 0, 1]])
+        views.append(View(f"{number:03d}", image[..., ::-1].astype(np.float32) / 255))
+        cameras.append(
+            Camera(name, *SIZE, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
+        )
+    return Case(names, views, cameras)
+
+
+def count_labels(case: Case, scan: Scan, teeth: Teeth) -> tuple[int, int, int]:
+    """Crowns labelled right, wrong, and left without a number. Those at the row's ends are out."""
+    right = wrong = none = 0
+    for camera, dentition, placed in zip(
+        case.cameras, teeth.dentitions, teeth.fit.views, strict=True
+    ):
+        if dentition is None or placed is None:
+            continue
+        truth, _ = scan.look(camera)
+        for jaw in ("upper", "lower"):
+            for crown, label in zip(dentition.crowns(jaw), placed.teeth(jaw), strict=True):
+                inside = truth[_middle_of(crown, truth.shape)]
+                inside = inside[(inside > 0) & ((inside < 30) == (jaw == "upper"))]
+                if crown.cut_left or crown.cut_right or not len(inside):
+                    continue
+                true = int(np.bincount(inside).argmax())
+                right += label == true
+                none += label == 0
+                wrong += label not in (true, 0)
+    return right, wrong, none
+
+
+def _middle_of(crown, shape):  # type: ignore[no-untyped-def]
+    """The middle half of a crown as slices."""
+    ends = np.stack([crown.zenith, 0.5 * (crown.zenith + crown.tip)])
+    rows = np.sort(ends[:, 1]).astype(int)
+    column = int(crown.zenith[0])
+    reach = max(int(0.25 * crown.width), 1)
+    return slice(max(rows[0], 0), min(rows[1] + 1, shape[0])), slice(
+        max(column - reach, 0), min(column + reach + 1, shape[1])
+    )
+
+
+def rotation_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> Array:
+    """Degrees per view after the one rotation that fits best."""
+    pairs = [(v.cam_from_world[:3, :3], c.rotation)
+             for v, c in zip(placed, case.cameras, strict=True) if v is not None]  # fmt: skip
+    u, _, vt = np.linalg.svd(sum(truth.T @ found for found, truth in pairs))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    relative = [found @ (truth @ turn).T for found, truth in pairs]
+    return np.degrees([Rotation.from_matrix(matrix).magnitude() for matrix in relative])
+
+
+def surface_scores(case: Case, scan: Scan, teeth: Teeth) -> tuple[float, float, float, float]:
+    """Median and 90 % of the distance of tooth depths to the scan after similarity and ICP, mm;
+    share within 1 mm; share of the tooth pixels that have depth."""
+    found, truth, covered, shown = [], [], 0, 0
+    for camera, view, dentition, placed in zip(
+        case.cameras, teeth.surface.views, teeth.dentitions, teeth.fit.views, strict=True
+    ):
+        if view is None or dentition is None or placed is None:
+            continue
+        ours = Camera("", *SIZE, placed.focal, placed.focal, SIZE[0] / 2, SIZE[1] / 2,
+                      placed.cam_from_world)  # fmt: skip
+        ids, points = scan.look(camera)
+        tooth = _tooth_pixels(case, ids, dentition)
+        covered += int((tooth & (view.depth > 0)).sum())
+        shown += int(tooth.sum())
+        both = tooth & (view.depth > 0) & np.isfinite(points[..., 0])
+        found.append(ours.unproject(view.depth)[both])
+        truth.append(points[both])
+    source, target = np.concatenate(found), np.concatenate(truth)
+    drawn = np.random.default_rng(0).permutation(len(source))[:15_000]
+    motion = _similarity(source, target)
+    for _ in range(5):
+        motion = _similarity(*_best(source, target, motion))
+    for _ in range(25):
+        nearest = scan.nearest(_moved(source[drawn], motion))
+        motion = _similarity(*_best(source[drawn], nearest, motion))
+    placed_points = _moved(source, motion)
+    distance = np.linalg.norm(scan.nearest(placed_points) - placed_points, axis=1)
+    return (
+        float(np.median(distance)), float(np.percentile(distance, 90)),
+        float(np.mean(distance < 1)), covered / shown,
+    )  # fmt: skip
+
+
+def _tooth_pixels(case: Case, ids: npt.NDArray[np.int64], dentition: Dentition):  # type: ignore[no-untyped-def]
+    """Where the photograph shows teeth: by the scan where the camera is exact, else as found."""
+    tooth = dentition.mask if case.name == PHOTOS else ids > 0
+    return cv2.erode(tooth.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+
+
+def _similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(sign) @ vt
+    scale = float((s * sign).sum() / (a**2).sum())
+    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
+
+
+def _moved(points: Array, motion: tuple[float, Array, Array]) -> Array:
+    return motion[0] * points @ motion[1].T + motion[2]
+
+
+def _best(source: Array, target: Array, motion):  # type: ignore[no-untyped-def]
+    error = np.linalg.norm(_moved(source, motion) - target, axis=1)
+    kept = error < np.percentile(error, KEPT)
+    return source[kept], target[kept]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", default="", help="one set, as 001,012,022 or 'photos'")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--pictures", type=Path, help="where to write the pictures")
+    options = parser.parse_args()
+    scan = Scan(options.data / "scan_video_a" / "teeth.ply")
+    sets = [*TRIPLES, PHOTOS] if (options.data / "dental_photos_a").is_dir() else [*TRIPLES]
+    if options.only:
+        sets = [PHOTOS if options.only == "photos" else options.only]
+    print(
+        "| set | labels right / wrong / none | margin | rotation, degrees | surface median / p90, "
+        "mm | within 1 mm | covered | CPU s | wall s |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for names in sets:
+        case = read_case(options.data, names)
+        cpu, wall = time.process_time(), time.perf_counter()
+        try:
+            teeth = reconstruct_teeth(
+                case.views, names.split(","), [None] * len(case.views), PhotoOptions(),
+                ArchOptions(), SurfaceOptions(), accept_doubtful=False, seed=0,
+                threads=options.threads, progress=lambda *_: None,
+            )  # fmt: skip
+        except ReconstructionError as error:
+            print(f"| {names} | {error} |")
+            continue
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        labels = " / ".join(map(str, count_labels(case, scan, teeth)))
+        errors = " ".join(f"{error:.1f}" for error in rotation_errors(case, teeth.fit.views))
+        median, most, within, covered = surface_scores(case, scan, teeth)
+        print(f"| {names} | {labels} | {teeth.fit.margin:.0f} | {errors} | {median:.3f} / "
+              f"{most:.2f} | {100 * within:.0f} % | {100 * covered:.1f} % | {cpu:.1f} | "
+              f"{wall:.1f} |", flush=True)  # fmt: skip
+        if options.pictures:
+            options.pictures.mkdir(parents=True, exist_ok=True)
+            for name in ("teeth", "turned"):
+                path = options.pictures / f"{names.replace(',', '_')}_{name}.png"
+                cv2.imwrite(str(path), teeth.pictures[name][..., ::-1])
+
+
+if __name__ == "__main__":
+    main()
