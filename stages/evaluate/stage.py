@@ -43,7 +43,7 @@ class EvaluateStage(Stage):
     """Views, cameras and Gaussians -> metrics of the input views."""
 
     name = "evaluate"
-    version = 1
+    version = 2
     summary = "PSNR and SSIM of the renders against the input photographs, side by side pictures"
     Config = EvaluateConfig
     requires = ("views", "cameras", "gaussians")

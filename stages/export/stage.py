@@ -81,7 +81,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 1
+    version = 2
     summary = "viewer page, splats, mesh, video, COLMAP model and nerfstudio cameras"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")

@@ -17,6 +17,7 @@ Floats = npt.NDArray[np.float32]
 F = np.float32
 HARMONICS = 11
 CHUNK = 256
+CAMERA_GRADIENTS = 10
 
 C0 = F(0.28209479177387814)
 C1 = F(0.4886025119029199)
@@ -90,14 +91,15 @@ def features_forward(  # type: ignore[no-untyped-def]
 
     Args:
         packed: [N, 11 + 3 K] scene.
-        degree: of the harmonics, 0..3; K >= (degree + 1)^2.
+        degree: of the harmonics, 0..3; K >= (degree + 1)^2. -1 for no colour.
         centre: [3] camera centre in the world.
-        screen: [N, 9] projected Gaussians.
+        screen: [N, 12] projected Gaussians.
         next_pose, next_intrinsics: [3, 4] and [4], the camera that flow leads to.
         intrinsics: [4] of this camera.
         with_depth, with_flow: 1 to add a depth feature, then two flow features (px).
         near: depth at which the next camera's division is held.
-        features: [N, 3 + with_depth + 2 with_flow] output.
+        features: [N, >= 3 + with_depth + 2 with_flow] output; columns after those are left alone,
+            and without colour there are three less.
     """
     number = packed.shape[0]
     terms = (degree + 1) * (degree + 1)
@@ -106,19 +108,22 @@ def features_forward(  # type: ignore[no-untyped-def]
         for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
             if screen[i, 6] < F(0):
                 continue
-            x, y, z = packed[i, 0] - centre[0], packed[i, 1] - centre[1], packed[i, 2] - centre[2]
-            length = F(1) / math.sqrt(x * x + y * y + z * z)
-            _basis(x * length, y * length, z * length, degree, basis)
-            red, green, blue = F(0.5), F(0.5), F(0.5)
-            for k in range(terms):
-                column = HARMONICS + 3 * k
-                red += basis[k] * packed[i, column]
-                green += basis[k] * packed[i, column + 1]
-                blue += basis[k] * packed[i, column + 2]
-            features[i, 0] = max(red, F(0))
-            features[i, 1] = max(green, F(0))
-            features[i, 2] = max(blue, F(0))
-            column = 3
+            column = 0
+            if degree >= 0:
+                x, y = packed[i, 0] - centre[0], packed[i, 1] - centre[1]
+                z = packed[i, 2] - centre[2]
+                length = F(1) / math.sqrt(x * x + y * y + z * z)
+                _basis(x * length, y * length, z * length, degree, basis)
+                red, green, blue = F(0.5), F(0.5), F(0.5)
+                for k in range(terms):
+                    column = HARMONICS + 3 * k
+                    red += basis[k] * packed[i, column]
+                    green += basis[k] * packed[i, column + 1]
+                    blue += basis[k] * packed[i, column + 2]
+                features[i, 0] = max(red, F(0))
+                features[i, 1] = max(green, F(0))
+                features[i, 2] = max(blue, F(0))
+                column = 3
             if with_depth == 1:
                 features[i, column] = screen[i, 8]
                 column += 1
@@ -142,14 +147,14 @@ def features_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Gradient of `features_forward`; runs after `project_backward`, to which it adds.
 
-    The part of flow that comes from this camera's projection is added to the centre's gradient in
-    `screen_gradient` by `flow_to_centre` beforehand.
+    The part of flow that comes from this camera's projection has been taken from the centre's
+    gradient in `screen_gradient` beforehand.
 
     Args:
         screen_gradient: [N, 8 + F], features from column 8.
         gradient: [N, 11 + 3 K]; columns 0:3 are added to, 11: are set.
-        camera_parts: [chunks, 8]; translation is added to.
-        next_parts: [chunks, 6] output, twist of the next camera.
+        camera_parts: [chunks, 10]; the twist is added to.
+        next_parts: [chunks, 10] output, as `camera_parts`, of the next camera.
     """
     number = packed.shape[0]
     columns = packed.shape[1]
@@ -157,45 +162,50 @@ def features_backward(  # type: ignore[no-untyped-def]
     for chunk in prange((number + CHUNK - 1) // CHUNK):
         basis = np.zeros(16, np.float32)
         d_basis = np.zeros(16, np.float32)
-        for k in range(6):
+        for k in range(CAMERA_GRADIENTS):
             next_parts[chunk, k] = F(0)
         for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
             for column in range(HARMONICS, columns):
                 gradient[i, column] = F(0)
             if screen[i, 6] < F(0):
                 continue
-            x, y, z = packed[i, 0] - centre[0], packed[i, 1] - centre[1], packed[i, 2] - centre[2]
-            length = F(1) / math.sqrt(x * x + y * y + z * z)
-            x, y, z = x * length, y * length, z * length
-            _basis(x, y, z, degree, basis)
-            red = screen_gradient[i, 8] if features[i, 0] > F(0) else F(0)
-            green = screen_gradient[i, 9] if features[i, 1] > F(0) else F(0)
-            blue = screen_gradient[i, 10] if features[i, 2] > F(0) else F(0)
-            for k in range(terms):
-                column = HARMONICS + 3 * k
-                gradient[i, column] = basis[k] * red
-                gradient[i, column + 1] = basis[k] * green
-                gradient[i, column + 2] = basis[k] * blue
-                d_basis[k] = (
-                    packed[i, column] * red
-                    + packed[i, column + 1] * green
-                    + packed[i, column + 2] * blue
-                )
-            if degree > 0:
-                dx, dy, dz = _basis_pullback(x, y, z, degree, d_basis)
-                along = dx * x + dy * y + dz * z
-                dx, dy, dz = (
-                    (dx - along * x) * length,
-                    (dy - along * y) * length,
-                    (dz - along * z) * length,
-                )
-                gradient[i, 0] += dx
-                gradient[i, 1] += dy
-                gradient[i, 2] += dz
-                # the centre -R^T t moves by -R^T v under a twist (v, w)
-                for k in range(3):
-                    camera_parts[chunk, k] += pose[k, 0] * dx + pose[k, 1] * dy + pose[k, 2] * dz
-            column = 11
+            column = 8
+            if degree >= 0:
+                x, y = packed[i, 0] - centre[0], packed[i, 1] - centre[1]
+                z = packed[i, 2] - centre[2]
+                length = F(1) / math.sqrt(x * x + y * y + z * z)
+                x, y, z = x * length, y * length, z * length
+                _basis(x, y, z, degree, basis)
+                red = screen_gradient[i, 8] if features[i, 0] > F(0) else F(0)
+                green = screen_gradient[i, 9] if features[i, 1] > F(0) else F(0)
+                blue = screen_gradient[i, 10] if features[i, 2] > F(0) else F(0)
+                for k in range(terms):
+                    column = HARMONICS + 3 * k
+                    gradient[i, column] = basis[k] * red
+                    gradient[i, column + 1] = basis[k] * green
+                    gradient[i, column + 2] = basis[k] * blue
+                    d_basis[k] = (
+                        packed[i, column] * red
+                        + packed[i, column + 1] * green
+                        + packed[i, column + 2] * blue
+                    )
+                if degree > 0:
+                    dx, dy, dz = _basis_pullback(x, y, z, degree, d_basis)
+                    along = dx * x + dy * y + dz * z
+                    dx, dy, dz = (
+                        (dx - along * x) * length,
+                        (dy - along * y) * length,
+                        (dz - along * z) * length,
+                    )
+                    gradient[i, 0] += dx
+                    gradient[i, 1] += dy
+                    gradient[i, 2] += dz
+                    # the centre -R^T t moves by -R^T v under a twist (v, w)
+                    for k in range(3):
+                        camera_parts[chunk, k] += (
+                            pose[k, 0] * dx + pose[k, 1] * dy + pose[k, 2] * dz
+                        )
+                column = 11
             x, y, z = packed[i, 0], packed[i, 1], packed[i, 2]
             if with_depth == 1:
                 dz = screen_gradient[i, column]
@@ -225,3 +235,8 @@ def features_backward(  # type: ignore[no-untyped-def]
                 next_parts[chunk, 3] += ny * dz - nz * dy
                 next_parts[chunk, 4] += nz * dx - nx * dz
                 next_parts[chunk, 5] += nx * dy - ny * dx
+                du, dv = screen_gradient[i, column], screen_gradient[i, column + 1]
+                next_parts[chunk, 6] += du * nx * iz
+                next_parts[chunk, 7] += dv * ny * iz
+                next_parts[chunk, 8] += du
+                next_parts[chunk, 9] += dv

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting.lane_types import WIDTH as LANES
+from stages.splatting.lanes import load_from, store_from
 from stages.splatting.threads import KERNELS
 
 Floats = npt.NDArray[np.float32]
@@ -24,6 +26,19 @@ WINDOW = (_window / _window.sum()).astype(np.float32)
 C1, C2 = F(0.01**2), F(0.03**2)
 #: rows of a strip: the unit of parallel work
 STRIP = 32
+
+
+@njit(inline="always", error_model="numpy")
+def _blur(source, start, step, target, to, wide):  # type: ignore[no-untyped-def]
+    """Window over items `step` apart of `source`, from `start` on: `wide` results at `to`.
+
+    Sums stay in a register; the plain loop over an array stores and loads them at every tap.
+    """
+    for x in range(0, wide, LANES):
+        total = load_from(source, start + x) * WINDOW[0]
+        for k in range(1, TAPS):
+            total += load_from(source, start + x + k * step) * WINDOW[k]
+        store_from(target, to + x, total)
 
 
 @njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
@@ -47,8 +62,9 @@ def ssim_forward(  # type: ignore[no-untyped-def]
         y0 = (job % strips) * STRIP
         y1 = min(height, y0 + STRIP)
         rows = y1 - y0 + 2 * HALF
-        across = np.zeros((5, STRIP + 2 * HALF, width), np.float32)
-        padded = np.zeros((5, width + TAPS), np.float32)
+        wide = (width + LANES - 1) // LANES * LANES
+        across = np.zeros((5, STRIP + 2 * HALF, wide), np.float32)
+        padded = np.zeros((5, wide + LANES), np.float32)
         maps = 3 if known == 1 else 5
         for row in range(rows):
             y = y0 - HALF + row
@@ -63,21 +79,16 @@ def ssim_forward(  # type: ignore[no-untyped-def]
                 padded[3, x + HALF] = t
                 padded[4, x + HALF] = t * t
             for j in range(maps):
-                for k in range(TAPS):
-                    w = WINDOW[k]
-                    for x in range(width):
-                        across[j, row, x] += w * padded[j, x + k]
-        moments = np.zeros((5, width), np.float32)
+                _blur(
+                    padded, j * (wide + LANES), 1,
+                    across, (j * (STRIP + 2 * HALF) + row) * wide, wide,
+                )  # fmt: skip
+        moments = np.zeros((5, wide), np.float32)
         sums[job, 0] = sums[job, 1] = sums[job, 2] = 0.0
         for row in range(y1 - y0):
             y = y0 + row
             for j in range(maps):
-                for x in range(width):
-                    moments[j, x] = F(0)
-                for k in range(TAPS):
-                    w = WINDOW[k]
-                    for x in range(width):
-                        moments[j, x] += w * across[j, row + k, x]
+                _blur(across, (j * (STRIP + 2 * HALF) + row) * wide, wide, moments, j * wide, wide)
             if known == 1:
                 for x in range(width):
                     moments[3, x] = target_mean[channel, y, x]
@@ -129,9 +140,10 @@ def ssim_backward(  # type: ignore[no-untyped-def]
         y0 = (job % strips) * STRIP
         y1 = min(height, y0 + STRIP)
         rows = y1 - y0 + 2 * HALF
-        across = np.zeros((3, STRIP + 2 * HALF, width), np.float32)
-        padded = np.zeros((3, width + TAPS), np.float32)
-        moments = np.zeros((3, width), np.float32)
+        wide = (width + LANES - 1) // LANES * LANES
+        across = np.zeros((3, STRIP + 2 * HALF, wide), np.float32)
+        padded = np.zeros((3, wide + LANES), np.float32)
+        moments = np.zeros((3, wide), np.float32)
         for row in range(rows):
             y = y0 - HALF + row
             if y < 0 or y >= height:
@@ -141,19 +153,14 @@ def ssim_backward(  # type: ignore[no-untyped-def]
                 padded[1, x + HALF] = d_square[channel, y, x]
                 padded[2, x + HALF] = d_product[channel, y, x]
             for j in range(3):
-                for k in range(TAPS):
-                    w = WINDOW[k]
-                    for x in range(width):
-                        across[j, row, x] += w * padded[j, x + k]
+                _blur(
+                    padded, j * (wide + LANES), 1,
+                    across, (j * (STRIP + 2 * HALF) + row) * wide, wide,
+                )  # fmt: skip
         for row in range(y1 - y0):
             y = y0 + row
             for j in range(3):
-                for x in range(width):
-                    moments[j, x] = F(0)
-                for k in range(TAPS):
-                    w = WINDOW[k]
-                    for x in range(width):
-                        moments[j, x] += w * across[j, row + k, x]
+                _blur(across, (j * (STRIP + 2 * HALF) + row) * wide, wide, moments, j * wide, wide)
             for x in range(width):
                 p, t = image[channel, y, x], target[channel, y, x]
                 sign = F(1) if p > t else (F(-1) if p < t else F(0))

@@ -4,10 +4,11 @@ A scene is one packed matrix [N, 11 + 3 K] float32 (K = spherical-harmonics coef
 
     0:3 mean | 3:7 quaternion wxyz | 7:10 log scale | 10 logit opacity | 11: harmonics, K x 3
 
-and a projected Gaussian is one row of `screen` [N, 9] float32:
+and a projected Gaussian is one row of `screen` [N, 12] float32:
 
-    0:2 centre (px) | 2:5 inverse 2D covariance a, b, c | 5 opacity | 6:8 half width, half height of
-    the ellipse where alpha falls below its cut (px; negative: not visible) | 8 depth z
+    0:2 centre (px) | 2:5 inverse 2D covariance a, b, c | 5 opacity, compensated if antialiased |
+    6:8 half width, half height of the ellipse where alpha falls below its cut (px; negative: not
+    visible) | 8 depth z | 9 inverse of the variance along y | 10 log2 of the opacity | 11 b / a
 
 Every kernel works in chunks of fixed length, so that its result does not depend on the number of
 threads (a vectorised loop may round differently from its scalar remainder). The functions that a
@@ -28,11 +29,13 @@ F = np.float32
 
 #: first column of the harmonics in the packed matrix
 HARMONICS = 11
-SCREEN_COLUMNS = 9
+SCREEN_COLUMNS = 12
 #: Gaussians per chunk
 CHUNK = 256
 #: columns of a row of screen gradients: centre 2, conic 3, opacity, |centre| 2; then the features
 SCREEN_GRADIENTS = 8
+#: columns of the gradient of a camera: twist (translation 3, rotation 3), fx, fy, cx, cy
+CAMERA_GRADIENTS = 10
 
 
 @njit(error_model="numpy")
@@ -69,9 +72,10 @@ def _slope_limits(intrinsics, width, height):  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_forward(  # type: ignore[no-untyped-def]
     packed: Floats, pose: Floats, intrinsics: Floats, width: int, height: int,
-    near: np.float32, low_pass: np.float32, alpha_cut: np.float32, screen: Floats,
+    near: np.float32, low_pass: np.float32, alpha_cut: np.float32, antialiased: int,
+    screen: Floats,
 ):  # fmt: skip
-    """Project every Gaussian; fills `screen` [N, 9].
+    """Project every Gaussian; fills `screen` [N, 12].
 
     Args:
         packed: [N, 11 + 3 K] scene.
@@ -81,6 +85,7 @@ def project_forward(  # type: ignore[no-untyped-def]
         near: Gaussians whose centre is nearer are not drawn.
         low_pass: variance added to the 2D covariance, in px^2.
         alpha_cut: contributions below this alpha are left out.
+        antialiased: 1 to take from the opacity what the low-pass adds to the area (Mip-Splatting).
         screen: output.
     """
     number = packed.shape[0]
@@ -129,11 +134,16 @@ def project_forward(  # type: ignore[no-untyped-def]
             n0 = a01 * a12 - a02 * a11
             n1 = a02 * a10 - a00 * a12
             n2 = a00 * a11 - a01 * a10
-            determinant = n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (xx + yy + low_pass)
+            sharp = n0 * n0 + n1 * n1 + n2 * n2
+            determinant = sharp + low_pass * (xx + yy + low_pass)
             xx += low_pass
             yy += low_pass
             if not (determinant > F(1e-12) and determinant < F(1e30)):
                 continue
+            if antialiased == 1:
+                opacity *= math.sqrt(sharp / determinant)
+                if not opacity > alpha_cut:
+                    continue
             u, v = fx * px * inverse_z + cx, fy * py * inverse_z + cy
             reach = F(2) * math.log(opacity / alpha_cut)
             half_width, half_height = math.sqrt(reach * xx), math.sqrt(reach * yy)
@@ -151,28 +161,33 @@ def project_forward(  # type: ignore[no-untyped-def]
             screen[i, 5] = opacity
             screen[i, 6] = half_width
             screen[i, 7] = half_height
+            screen[i, 9] = F(1) / yy
+            screen[i, 10] = math.log2(opacity)
+            screen[i, 11] = -xy / yy
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_backward(  # type: ignore[no-untyped-def]
     packed: Floats, pose: Floats, intrinsics: Floats, width: int, height: int,
-    screen: Floats, screen_gradient: Floats, gradient: Floats, camera_parts: Floats,
+    low_pass: np.float32, antialiased: int, screen: Floats, screen_gradient: Floats,
+    gradient: Floats, camera_parts: Floats,
 ):  # fmt: skip
     """Gradients of means, quaternions, log scales and logit opacities, and of the camera.
 
     Args:
-        packed, pose, intrinsics, width, height, screen: as in `project_forward`.
+        packed, pose, intrinsics, width, height, low_pass, antialiased, screen: as in
+            `project_forward`.
         screen_gradient: [N, >= 8] per Gaussian: centre (2), conic a, b, c (3), opacity.
         gradient: [N, 11 + 3 K]; columns 0:11 are set (rows of invisible Gaussians to 0).
-        camera_parts: [ceil(N / CHUNK), 8] per chunk: twist (translation 3, rotation 3) of
-            cam_from_world, multiplied from the left, then fx, fy. To be summed in order.
+        camera_parts: [ceil(N / CHUNK), 10] per chunk: twist (translation 3, rotation 3) of
+            cam_from_world, multiplied from the left, then fx, fy, cx, cy. To be summed in order.
     """
     number = packed.shape[0]
     fx, fy = intrinsics[0], intrinsics[1]
     left, right, top, bottom = _slope_limits(intrinsics, width, height)
     two = F(2)
     for chunk in prange((number + CHUNK - 1) // CHUNK):
-        camera = np.zeros(8, np.float32)
+        camera = np.zeros(CAMERA_GRADIENTS, np.float32)
         for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
             for column in range(HARMONICS):
                 gradient[i, column] = F(0)
@@ -222,6 +237,22 @@ def project_backward(  # type: ignore[no-untyped-def]
                 two * (dxy * a00 + dyy * a10), two * (dxy * a01 + dyy * a11),
                 two * (dxy * a02 + dyy * a12),
             )  # fmt: skip
+            faded = screen_gradient[i, 5] * screen[i, 5]
+            if antialiased == 1:
+                # opacity = sigmoid * |n| / sqrt(det), n = a0 x a1, det = |n|^2 + low-pass part
+                n0, n1, n2 = a01 * a12 - a02 * a11, a02 * a10 - a00 * a12, a00 * a11 - a01 * a10
+                sharp = n0 * n0 + n1 * n1 + n2 * n2
+                trace = a00 * a00 + a01 * a01 + a02 * a02 + a10 * a10 + a11 * a11 + a12 * a12
+                determinant = sharp + low_pass * (trace + low_pass)
+                # d log(opacity) = by_n d|n|^2 / 2 - by_trace d(trace) / 2
+                by_trace = faded * low_pass / determinant
+                by_n = by_trace * (trace + low_pass) / max(sharp, F(1e-30))
+                da00 += by_n * (a11 * n2 - a12 * n1) - by_trace * a00
+                da01 += by_n * (a12 * n0 - a10 * n2) - by_trace * a01
+                da02 += by_n * (a10 * n1 - a11 * n0) - by_trace * a02
+                da10 += by_n * (n1 * a02 - n2 * a01) - by_trace * a10
+                da11 += by_n * (n2 * a00 - n0 * a02) - by_trace * a11
+                da12 += by_n * (n0 * a01 - n1 * a00) - by_trace * a12
             dj00 = da00 * b00 + da01 * b01 + da02 * b02
             dj02 = da00 * b20 + da01 * b21 + da02 * b22
             dj11 = da10 * b10 + da11 * b11 + da12 * b12
@@ -265,8 +296,7 @@ def project_backward(  # type: ignore[no-untyped-def]
             gradient[i, 4] = (dqx - along * qx) * norm
             gradient[i, 5] = (dqy - along * qy) * norm
             gradient[i, 6] = (dqz - along * qz) * norm
-            opacity = screen[i, 5]
-            gradient[i, 10] = screen_gradient[i, 5] * opacity * (F(1) - opacity)
+            gradient[i, 10] = faded / (F(1) + math.exp(packed[i, 10]))
 
             # centre in the camera: through u, v, and through the Jacobian
             gu, gv = screen_gradient[i, 0], screen_gradient[i, 1]
@@ -275,14 +305,20 @@ def project_backward(  # type: ignore[no-untyped-def]
             dpz -= (dj00 * j00 + dj02 * j02 + dj11 * j11 + dj12 * j12) * iz
             dfx = gu * slope_x + dj00 * iz
             dfy = gv * slope_y + dj11 * iz
+            dcx, dcy = gu, gv
             if left < slope_x < right:
                 dpx -= dj02 * fx * iz * iz
                 dpz += dj02 * fx * slope_x * iz * iz
                 dfx -= dj02 * tx * iz
+            else:
+                # held at the border, whose distance from the principal point is in pixels
+                dcx += dj02 * iz
             if top < slope_y < bottom:
                 dpy -= dj12 * fy * iz * iz
                 dpz += dj12 * fy * slope_y * iz * iz
                 dfy -= dj12 * ty * iz
+            else:
+                dcy += dj12 * iz
             gradient[i, 0] = pose[0, 0] * dpx + pose[1, 0] * dpy + pose[2, 0] * dpz
             gradient[i, 1] = pose[0, 1] * dpx + pose[1, 1] * dpy + pose[2, 1] * dpz
             gradient[i, 2] = pose[0, 2] * dpx + pose[1, 2] * dpy + pose[2, 2] * dpz
@@ -297,5 +333,7 @@ def project_backward(  # type: ignore[no-untyped-def]
             camera[5] += b00 * db10 - b10 * db00 + b01 * db11 - b11 * db01 + b02 * db12 - b12 * db02
             camera[6] += dfx
             camera[7] += dfy
-        for k in range(8):
+            camera[8] += dcx
+            camera[9] += dcy
+        for k in range(CAMERA_GRADIENTS):
             camera_parts[chunk, k] = camera[k]

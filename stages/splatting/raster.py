@@ -1,12 +1,13 @@
 """Alpha compositing of projected Gaussians in 16x16 tiles and its gradient, as numba kernels.
 
-A row of a tile is the vectorised loop (16 lanes). The first three features of a Gaussian are its
-colour; any further ones (depth, flow, ...) run in a loop of their own over the same weights, so
+A row of a tile is one vector of 16 lanes (see `lanes`). The first three features of a Gaussian are
+its colour; any further ones (depth, flow, ...) run in a loop of their own over the same weights, so
 that one compiled kernel serves every number of channels. No atomics: each pair (tile, Gaussian)
-has its own slot of gradients, and `gather` sums the slots of a Gaussian in a fixed order.
+has its own slot of sums, and `gather.gather` adds the slots of a Gaussian in a fixed order.
 
-Look at the assembly when changing these loops (`benchmarks/rasterizer.py --assembly`): a small
-change can stop LLVM from vectorising them, at five times the cost.
+With t = dx + (b / a) dy the ellipse a dx^2 + 2 b dx dy + c dy^2 is a t^2 + e dy^2, where 1 / e is
+the variance along y: one shift per row instead of a mixed term, and no cancellation between large
+terms far from the centre of a long thin Gaussian.
 """
 
 from __future__ import annotations
@@ -15,9 +16,27 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from llvmlite import ir
-from numba import njit, prange, types
-from numba.extending import intrinsic
+from numba import njit, prange
+
+from stages.splatting.lanes import (
+    absolute,
+    any_of,
+    at_least,
+    at_most,
+    constant,
+    count_up,
+    item,
+    largest,
+    load,
+    prefetch,
+    scale_by_power,
+    spread,
+    store,
+    sums,
+    to_float,
+    truncate,
+    where,
+)
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -25,42 +44,86 @@ F = np.float32
 I = np.int32
 
 TILE = 16
-CHUNK = 256
 GOLDEN = 0.6180339887
 #: largest alpha of one Gaussian, and transmittance below which a pixel is finished (as 3DGS)
 ALPHA_MAX = F(0.99)
 TRANSMITTANCE_MIN = F(1e-4)
 NEVER = I(2147483647)
 HALF_LOG2E = F(0.5 * 1.4426950408889634)
-SLOT_COLUMNS = 8
+#: a slot holds 11 sums and this many further features; what is more takes 16 each time
+FIRST_EXTRAS = 5
+#: pairs between two looks at which rows of a tile are finished
+PATIENCE = 16
+#: pairs ahead whose Gaussian is brought into the cache
+AHEAD = 4
+SCREEN_COLUMNS = 12
+#: px that the rows of an ellipse are widened by, against rounding
+SAFETY = F(0.01)
 
 
-@intrinsic
-def _float_from_bits(typing_context, bits):  # type: ignore[no-untyped-def]
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.bitcast(arguments[0], ir.FloatType())
+@njit(inline="always", error_model="numpy")
+def _exp2(x, lowest, p0, p1, p2, p3, p4):  # type: ignore[no-untyped-def]
+    """2^x for x <= 0, relative error 3e-6: minimax polynomial on (-1, 0] times a power of two.
 
-    return types.float32(types.int32), generate
-
-
-@njit(inline="always", fastmath=True, error_model="numpy")
-def _exp2(x):  # type: ignore[no-untyped-def]
-    """2^x for x <= 0, relative error 3e-6: minimax polynomial on (-1, 0] times a power of two."""
-    x = max(x, F(-126.0))
-    whole = I(x)
-    part = x - F(whole)
-    power = F(0.99999741) + part * (
-        F(0.69303020) + part * (F(0.23934107) + part * (F(0.053074066) + part * F(0.0067670840)))
-    )
-    bits = I((whole + I(127)) << I(23))
-    return power * _float_from_bits(bits)  # type: ignore[call-arg]  # numba passes the context
+    `lowest` and the coefficients as `_exp2_constants` gives them.
+    """
+    x = at_least(x, lowest)
+    whole = truncate(x)
+    part = x - to_float(whole)
+    return scale_by_power(p0 + part * (p1 + part * (p2 + part * (p3 + part * p4))), whole)
 
 
-@njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def _exp2_constants():  # type: ignore[no-untyped-def]
+    return (
+        constant(F(-126.0)), constant(F(0.99999741)), constant(F(0.69303020)),
+        constant(F(0.23934107)), constant(F(0.053074066)), constant(F(0.0067670840)),
+    )  # fmt: skip
+
+
+@njit(inline="always", error_model="numpy")
+def _rows(mx, my, a, b, c, e, slope, reach, columns, rows):  # type: ignore[no-untyped-def]
+    """First row of a tile that an ellipse touches, and the one after the last.
+
+    Args:
+        mx, my: its centre, relative to the first pixel of the tile.
+        a, b, c, e, slope: its inverse covariance, 1 / variance along y, and b / a.
+        reach: its half height.
+        columns, rows: size of the tile.
+    """
+    # where the ellipse is highest and lowest; outside the tile the nearer edge counts. No branch:
+    # which way it goes can't be foreseen
+    shift = slope * reach
+    left, right = -mx, F(columns - 1) - mx
+    at_top, at_bottom = min(max(-shift, left), right), min(max(shift, left), right)
+    level, curve, inverse = c * e * reach * reach, a * e, F(1) / c
+    # not a number if the ellipse does not reach that edge: then all rows
+    top = my + (math.sqrt(level - curve * at_top * at_top) - b * at_top) * inverse + SAFETY
+    bottom = my - (math.sqrt(level - curve * at_bottom * at_bottom) + b * at_bottom) * inverse
+    bottom -= SAFETY
+    # math.floor and math.ceil would be calls, around which all vectors are saved
+    bottom = bottom if bottom > F(0) else F(0)
+    bottom = bottom if bottom < F(rows) else F(rows)
+    top = top if top < F(rows - 1) else F(rows - 1)
+    first = I(bottom)
+    first += I(F(first) < bottom)
+    after = I(top) + I(1) if top >= F(0) else I(0)
+    return first, max(first, after)
+
+
+@njit(error_model="numpy")
+def _workspace(vectors):  # type: ignore[no-untyped-def]
+    """Zeros [vectors, 16] that begin at a cache line: a vector across two lines costs double."""
+    raw = np.zeros((vectors + 1) * TILE, np.float32)
+    start = (-(raw.ctypes.data // 4)) % TILE
+    return raw[start : start + vectors * TILE].reshape(vectors, TILE)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
 def composite_forward(  # type: ignore[no-untyped-def]
     tiles_x: int, tiles_y: int, stride: int, offsets: Ints, members: Ints, screen: Floats,
-    features: Floats, alpha_cut: np.float32, image: Floats, transmittance: Floats, stop: Ints,
-    end: Ints,
+    features: Floats, alpha_cut: np.float32, mask: npt.NDArray[np.bool_], image: Floats,
+    transmittance: Floats, stop: Ints, end: Ints, spans: Ints,
 ):  # fmt: skip
     """Composite front to back.
 
@@ -69,244 +132,235 @@ def composite_forward(  # type: ignore[no-untyped-def]
         stride: odd step through the tiles, coprime to their number: spreads the full tiles in the
             middle of an image over the threads.
         offsets, members: from `fill_tiles`.
-        screen: [N, 9] projected Gaussians.
+        screen: [N, 12] projected Gaussians.
         features: [N, 3 + E].
         alpha_cut: alpha below which a contribution is left out.
+        mask: [H, W] pixels to render, or [0, 0] for all.
         image: [3 + E, H, W] output, without background.
         transmittance: [H, W] output, what is left of the light behind.
         stop: [H, W] output, index into `members` of the first Gaussian that a pixel leaves out.
         end: [tiles] output, where each tile stopped.
+        spans: [M] output, first row and the one after the last, times 256, of each pair.
     """
     height, width = transmittance.shape
     extras = image.shape[0] - 3
     tiles = tiles_x * tiles_y
+    masked = mask.shape[0] > 0
     for job in prange(tiles):
         tile = (job * stride) % tiles
         x0 = (tile % tiles_x) * TILE
         y0 = (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        # one array: each further one costs the vectorised loop checks that they don't overlap
-        state = np.zeros((4, TILE, TILE), np.float32)  # colour, transmittance
-        state[3] = F(1)
-        until = np.full((TILE, TILE), NEVER, np.int32)
-        extra = np.zeros((extras, TILE, TILE), np.float32)
-        weights = np.zeros(TILE, np.float32)
-        for r in range(TILE):
-            for x in range(TILE):
-                if r >= rows or x >= columns:
-                    until[r, x] = I(-1)
+        state = _workspace((4 + extras) * TILE)  # transmittance, colour, extras
+        final = _workspace(TILE)  # transmittance of the pixels that are finished, 0 in state
+        until = np.full((TILE, TILE), I(-1), np.int32)
+        for r in range(rows):
+            for x in range(columns):
+                if not masked or mask[y0 + r, x0 + x]:
+                    until[r, x] = NEVER
+                    state[r, x] = F(1)
+                else:
+                    final[r, x] = F(1)
+        open_rows = 0  # a bit each
+        lane = count_up()
+        lowest, p0, p1, p2, p3, p4 = _exp2_constants()
+        alpha_max, left_min, cut = (
+            constant(ALPHA_MAX), constant(TRANSMITTANCE_MIN), constant(alpha_cut)
+        )  # fmt: skip
         k = offsets[tile]
         last = offsets[tile + 1]
+        look = k
         while k < last:
+            if k == look:
+                look += PATIENCE
+                open_rows = 0
+                for r in range(TILE):
+                    open_rows |= int(largest(load(until, r)) == NEVER) << r
+                if open_rows == 0:
+                    break
+            if k + AHEAD < last:
+                prefetch(screen, item(members, k + AHEAD) * SCREEN_COLUMNS)
             i = members[k]
             mx = screen[i, 0] - F(x0) - F(0.5)
             my = screen[i, 1] - F(y0) - F(0.5)
-            a = screen[i, 2] * HALF_LOG2E
-            b = screen[i, 3] * (HALF_LOG2E * F(2))
-            c = screen[i, 4] * HALF_LOG2E
-            opacity = screen[i, 5]
-            reach = screen[i, 7]
+            a, b, c, e = screen[i, 2], screen[i, 3], screen[i, 4], screen[i, 9]
+            slope = screen[i, 11]
+            first, after = _rows(mx, my, a, b, c, e, slope, screen[i, 7], columns, rows)
+            spans[k] = first + I(256) * after
+            peak = screen[i, 10]
+            a2, e2 = a * HALF_LOG2E, e * HALF_LOG2E
             c0, c1, c2 = features[i, 0], features[i, 1], features[i, 2]
             here = I(k)
-            for r in range(
-                max(0, math.ceil(my - reach)), min(rows - 1, math.floor(my + reach)) + 1
-            ):
+            for r in range(first, after):
+                if (open_rows >> r) & 1 == 0:
+                    continue
                 dy = F(r) - my
-                cyy = c * dy * dy
-                by = b * dy
-                for x in range(TILE):
-                    dx = F(x) - mx
-                    alpha = min(opacity * _exp2(-(cyy + dx * (by + a * dx))), ALPHA_MAX)
-                    alpha = alpha if alpha >= alpha_cut else F(0)
-                    before = state[3, r, x]
-                    u = until[r, x]
-                    u = u if before * (F(1) - alpha) >= TRANSMITTANCE_MIN else min(u, here)
-                    until[r, x] = u
-                    alpha = alpha if here < u else F(0)
-                    w = alpha * before
-                    state[3, r, x] = before - w
-                    state[0, r, x] += w * c0
-                    state[1, r, x] += w * c1
-                    state[2, r, x] += w * c2
-                    weights[x] = w
-                for e in range(extras):
-                    value = features[i, 3 + e]
-                    for x in range(TILE):
-                        extra[e, r, x] += weights[x] * value
+                t = lane - (mx - slope * dy)
+                power = (peak - e2 * dy * dy) - a2 * t * t
+                alpha = at_most(_exp2(power, lowest, p0, p1, p2, p3, p4), alpha_max)
+                alpha = where(alpha >= cut, alpha, F(0))
+                before = load(state, r)
+                w = alpha * before
+                left = before - w
+                finished = (left < left_min) & (before > F(0))
+                # seldom: what is stored here under a mask would be slow to read again
+                if any_of(finished):
+                    store(until, r, where(finished, here, load(until, r)))
+                    store(final, r, where(finished, before, load(final, r)))
+                    w = where(finished, F(0), w)
+                    left = where(finished, F(0), left)
+                store(state, r, left)
+                store(state, TILE + r, load(state, TILE + r) + w * c0)
+                store(state, 2 * TILE + r, load(state, 2 * TILE + r) + w * c1)
+                store(state, 3 * TILE + r, load(state, 3 * TILE + r) + w * c2)
+                for j in range(extras):
+                    row = (4 + j) * TILE + r
+                    store(state, row, load(state, row) + w * features[i, 3 + j])
             k += 1
-            if (k & 15) == 0:
-                latest = I(-1)
-                for r in range(TILE):
-                    for x in range(TILE):
-                        latest = max(latest, until[r, x])
-                if latest < NEVER:
-                    break
         end[tile] = k
         for r in range(rows):
             for x in range(columns):
-                image[0, y0 + r, x0 + x] = state[0, r, x]
-                image[1, y0 + r, x0 + x] = state[1, r, x]
-                image[2, y0 + r, x0 + x] = state[2, r, x]
-                transmittance[y0 + r, x0 + x] = state[3, r, x]
                 stop[y0 + r, x0 + x] = until[r, x]
-            for e in range(extras):
+                transmittance[y0 + r, x0 + x] = state[r, x] if until[r, x] == NEVER else final[r, x]
+            for j in range(3 + extras):
                 for x in range(columns):
-                    image[3 + e, y0 + r, x0 + x] = extra[e, r, x]
+                    image[j, y0 + r, x0 + x] = state[(1 + j) * TILE + r, x]
 
 
-@njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@njit(parallel=True, cache=True, error_model="numpy")
 def composite_backward(  # type: ignore[no-untyped-def]
     tiles_x: int, tiles_y: int, stride: int, offsets: Ints, members: Ints, screen: Floats,
     features: Floats, alpha_cut: np.float32, transmittance: Floats, stop: Ints, end: Ints,
-    d_image: Floats, d_transmittance: Floats, slot_gradient: Floats,
+    spans: Ints, d_image: Floats, d_transmittance: Floats, slot_sums: Floats,
 ):  # fmt: skip
     """Gradient of `composite_forward`, back to front.
 
     Transmittance is rebuilt from its final value, from the last Gaussian that each pixel took.
-    Per lane only sums of ds, ds dy, ds dy^2 are kept, where exp(-s) is the Gaussian: dx is the same
-    for a lane, and dL/d(opacity) = -sum(ds) / opacity.
+    With exp(-s) the Gaussian and ds the gradient of s, a slot holds the sums over its pixels of
+    ds (1, dy, dy^2, dx, dx dy, dx^2), |ds t|, |ds ds/dy|, the blending weight times the gradient of
+    each of the features; `gather` makes gradients of them.
 
     Args:
         d_image: [3 + E, H, W], d_transmittance: [H, W]: gradients of the outputs.
-        slot_gradient: [M, 8 + 3 + E] output: centre 2, conic a b c, opacity, sums of the absolute
-            per-pixel gradients of the centre 2, features.
+        slot_sums: [M, 16 n] output.
     """
     height, width = transmittance.shape
     extras = d_image.shape[0] - 3
+    room = slot_sums.shape[1] // TILE
     tiles = tiles_x * tiles_y
     for job in prange(tiles):
         tile = (job * stride) % tiles
         x0 = (tile % tiles_x) * TILE
         y0 = (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        # few arrays: each costs the vectorised loop checks that it overlaps no other
-        state = np.zeros((2, TILE, TILE), np.float32)  # transmittance, light from behind
+        # transmittance, light from behind, gradients of the colour and of the other features
+        state = _workspace((5 + extras) * TILE)
         until = np.full((TILE, TILE), I(-1), np.int32)
-        d_colour = np.zeros((3, TILE, TILE), np.float32)
-        d_extra = np.zeros((extras, TILE, TILE), np.float32)
-        sums = np.zeros((10, TILE), np.float32)  # 8 sums; gradient through extras; weights
-        extra_sums = np.zeros((extras, TILE), np.float32)
+        extra_sums = _workspace(FIRST_EXTRAS + TILE * (room - 1))
         for r in range(rows):
             for x in range(columns):
-                state[0, r, x] = transmittance[y0 + r, x0 + x]
                 until[r, x] = stop[y0 + r, x0 + x]
-                state[1, r, x] = state[0, r, x] * d_transmittance[y0 + r, x0 + x]
-                d_colour[0, r, x] = d_image[0, y0 + r, x0 + x]
-                d_colour[1, r, x] = d_image[1, y0 + r, x0 + x]
-                d_colour[2, r, x] = d_image[2, y0 + r, x0 + x]
-            for e in range(extras):
+                left = transmittance[y0 + r, x0 + x]
+                state[r, x] = left
+                state[TILE + r, x] = left * d_transmittance[y0 + r, x0 + x]
+            for j in range(3 + extras):
                 for x in range(columns):
-                    d_extra[e, r, x] = d_image[3 + e, y0 + r, x0 + x]
+                    state[(2 + j) * TILE + r, x] = d_image[j, y0 + r, x0 + x]
+        row_until = np.empty(TILE, np.int32)
+        for r in range(TILE):
+            row_until[r] = largest(load(until, r))
+        lane = count_up()
+        lowest, p0, p1, p2, p3, p4 = _exp2_constants()
+        alpha_max, one, cut = constant(ALPHA_MAX), constant(F(1)), constant(alpha_cut)
         for k in range(end[tile] - 1, offsets[tile] - 1, -1):
             i = members[k]
             mx = screen[i, 0] - F(x0) - F(0.5)
             my = screen[i, 1] - F(y0) - F(0.5)
-            a, b, c = screen[i, 2], screen[i, 3], screen[i, 4]
-            a2, b2, c2 = a * HALF_LOG2E, b * (HALF_LOG2E * F(2)), c * HALF_LOG2E
-            opacity = screen[i, 5]
-            reach = screen[i, 7]
+            b, e = screen[i, 3], screen[i, 9]
+            slope = screen[i, 11]
+            a2, e2 = screen[i, 2] * HALF_LOG2E, e * HALF_LOG2E
+            peak = screen[i, 10]
             red, green, blue = features[i, 0], features[i, 1], features[i, 2]
             here = I(k)
-            for j in range(8):
-                for x in range(TILE):
-                    sums[j, x] = F(0)
-            for e in range(extras):
-                for x in range(TILE):
-                    extra_sums[e, x] = F(0)
-            for r in range(
-                max(0, math.ceil(my - reach)), min(rows - 1, math.floor(my + reach)) + 1
-            ):
+            if k - AHEAD >= offsets[tile]:
+                prefetch(screen, item(members, k - AHEAD) * SCREEN_COLUMNS)
+            s = sy = syy = abs_x = abs_y = s_red = s_green = s_blue = spread(F(0))
+            for j in range(extras):
+                store(extra_sums, j, spread(F(0)))
+            for r in range(spans[k] % 256, spans[k] // 256):
+                if item(row_until, r) <= here:
+                    continue
                 dy = F(r) - my
-                cyy = c2 * dy * dy
-                b2y = b2 * dy
-                by = b * dy
-                cy = c * dy
-                if extras > 0:
-                    for x in range(TILE):
-                        sums[8, x] = F(0)
-                for e in range(extras):
-                    value = features[i, 3 + e]
-                    for x in range(TILE):
-                        sums[8, x] += value * d_extra[e, r, x]
-                for x in range(TILE):
-                    dx = F(x) - mx
-                    raw = opacity * _exp2(-(cyy + dx * (b2y + a2 * dx)))
-                    alpha = min(raw, ALPHA_MAX)
-                    taken = (alpha >= alpha_cut) & (here < until[r, x])
-                    alpha = alpha if taken else F(0)
-                    inverse = F(1) / (F(1) - alpha)
-                    before = state[0, r, x] * inverse
-                    along = (
-                        red * d_colour[0, r, x]
-                        + green * d_colour[1, r, x]
-                        + blue * d_colour[2, r, x]
-                        + sums[8, x]
-                    )
-                    w = alpha * before
-                    rest = state[1, r, x]
-                    ds = alpha * (rest * inverse - before * along)
-                    ds = ds if raw <= ALPHA_MAX else F(0)
-                    state[1, r, x] = rest + w * along
-                    state[0, r, x] = before
-                    sums[0, x] += ds
-                    sums[1, x] += ds * dy
-                    sums[2, x] += ds * dy * dy
-                    sums[3, x] += abs(ds * (a * dx + by))
-                    sums[4, x] += abs(ds * (cy + b * dx))
-                    sums[5, x] += w * d_colour[0, r, x]
-                    sums[6, x] += w * d_colour[1, r, x]
-                    sums[7, x] += w * d_colour[2, r, x]
-                    sums[9, x] = w
-                for e in range(extras):
-                    for x in range(TILE):
-                        extra_sums[e, x] += sums[9, x] * d_extra[e, r, x]
-            s = sy = syy = sx = sxx = sxy = abs_x = abs_y = s_red = s_green = s_blue = F(0)
-            for x in range(TILE):
-                dx = F(x) - mx
-                s += sums[0, x]
-                sy += sums[1, x]
-                syy += sums[2, x]
-                sx += dx * sums[0, x]
-                sxx += dx * dx * sums[0, x]
-                sxy += dx * sums[1, x]
-                abs_x += sums[3, x]
-                abs_y += sums[4, x]
-                s_red += sums[5, x]
-                s_green += sums[6, x]
-                s_blue += sums[7, x]
-            slot_gradient[k, 0] = -(a * sx + b * sy)
-            slot_gradient[k, 1] = -(c * sy + b * sx)
-            slot_gradient[k, 2] = F(0.5) * sxx
-            slot_gradient[k, 3] = sxy
-            slot_gradient[k, 4] = F(0.5) * syy
-            slot_gradient[k, 5] = -s / opacity
-            slot_gradient[k, 6] = abs_x
-            slot_gradient[k, 7] = abs_y
-            slot_gradient[k, 8] = s_red
-            slot_gradient[k, 9] = s_green
-            slot_gradient[k, 10] = s_blue
-            for e in range(extras):
-                total = F(0)
-                for x in range(TILE):
-                    total += extra_sums[e, x]
-                slot_gradient[k, SLOT_COLUMNS + 3 + e] = total
+                t = lane - (mx - slope * dy)
+                power = (peak - e2 * dy * dy) - a2 * t * t
+                raw = _exp2(power, lowest, p0, p1, p2, p3, p4)
+                taken = (raw >= cut) & (load(until, r) > here)
+                alpha = where(taken, at_most(raw, alpha_max), F(0))
+                inverse = one / (one - alpha)
+                before = load(state, r) * inverse
+                d_red, d_green = load(state, 2 * TILE + r), load(state, 3 * TILE + r)
+                d_blue = load(state, 4 * TILE + r)
+                along = d_red * red + d_green * green + d_blue * blue
+                w = alpha * before
+                for j in range(extras):
+                    d_extra = load(state, (5 + j) * TILE + r)
+                    along += d_extra * features[i, 3 + j]
+                    store(extra_sums, j, load(extra_sums, j) + w * d_extra)
+                rest = load(state, TILE + r)
+                ds = alpha * (rest * inverse - before * along)
+                ds = where(raw <= alpha_max, ds, F(0))
+                store(state, TILE + r, rest + w * along)
+                store(state, r, before)
+                s += ds
+                d = ds * dy
+                sy += d
+                syy += d * dy
+                abs_x += absolute(ds * t)
+                abs_y += absolute(ds * (t * b + e * dy))
+                s_red += w * d_red
+                s_green += w * d_green
+                s_blue += w * d_blue
+            dx = lane - mx
+            sx, sxy = s * dx, sy * dx
+            if extras == 0:
+                # the usual case; sums of nothing cost nothing
+                zero = spread(F(0))
+                store(slot_sums, k * room, sums((
+                    s, sy, syy, sx, sxy, sx * dx, abs_x, abs_y, s_red, s_green, s_blue,
+                    zero, zero, zero, zero, zero,
+                )))  # fmt: skip
+                continue
+            store(slot_sums, k * room, sums((
+                s, sy, syy, sx, sxy, sx * dx, abs_x, abs_y, s_red, s_green, s_blue,
+                load(extra_sums, 0), load(extra_sums, 1), load(extra_sums, 2), load(extra_sums, 3),
+                load(extra_sums, 4),
+            )))  # fmt: skip
+            for j in range(1, room):
+                m = FIRST_EXTRAS + TILE * (j - 1)
+                store(slot_sums, k * room + j, sums((
+                    load(extra_sums, m), load(extra_sums, m + 1), load(extra_sums, m + 2),
+                    load(extra_sums, m + 3), load(extra_sums, m + 4), load(extra_sums, m + 5),
+                    load(extra_sums, m + 6), load(extra_sums, m + 7), load(extra_sums, m + 8),
+                    load(extra_sums, m + 9), load(extra_sums, m + 10), load(extra_sums, m + 11),
+                    load(extra_sums, m + 12), load(extra_sums, m + 13), load(extra_sums, m + 14),
+                    load(extra_sums, m + 15),
+                )))  # fmt: skip
         for k in range(end[tile], offsets[tile + 1]):
-            for j in range(SLOT_COLUMNS + 3 + extras):
-                slot_gradient[k, j] = F(0)
+            for j in range(room):
+                store(slot_sums, k * room + j, spread(F(0)))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
-def gather(first_slot: Ints, slots: Ints, slot_gradient: Floats, gradient: Floats):  # type: ignore[no-untyped-def]
-    """Sum the slots of each Gaussian, in the order of its tiles: [M, D] -> [N, D]."""
-    number, columns = gradient.shape
-    for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            for j in range(columns):
-                gradient[i, j] = F(0)
-            for q in range(first_slot[i], first_slot[i + 1]):
-                k = slots[q]
-                for j in range(columns):
-                    gradient[i, j] += slot_gradient[k, j]
+def slot_columns(features: int) -> int:
+    """Columns of a slot for 3 + E features."""
+    more = max(0, features - 3 - FIRST_EXTRAS)
+    return TILE * (1 + -(-more // TILE))
+
+
+def aligned_empty(rows: int, columns: int) -> Floats:
+    """[rows, columns] float32 that begins at a cache line (see `_workspace`)."""
+    raw = np.empty(rows * columns + TILE, np.float32)
+    start = (-(raw.ctypes.data // raw.itemsize)) % TILE
+    return raw[start : start + rows * columns].reshape(rows, columns)
 
 
 def tile_stride(tiles: int) -> int:

@@ -18,7 +18,7 @@ CHUNK = 256
 _DIGIT_BITS = 11
 
 
-# No fastmath here: `count_tiles` and `fill_tiles` must come to the same answer.
+# No fastmath here: `count_tiles` and `list_tiles` must come to the same answer.
 @njit(error_model="numpy")
 def _touches(dx0, dx1, dy0, dy1, a, b, c, reach):  # type: ignore[no-untyped-def]
     """Does the ellipse a x^2 + 2 b x y + c y^2 <= reach meet a rectangle (relative to its centre)?
@@ -59,15 +59,19 @@ def count_tiles(  # type: ignore[no-untyped-def]
             u, v, half_width, half_height = screen[i, 0], screen[i, 1], screen[i, 6], screen[i, 7]
             # pixel centres within the ellipse's box; clipped first, so that no cast overflows
             last_x, last_y = F(tiles_x * TILE - 1), F(tiles_y * TILE - 1)
-            x0 = math.ceil(max(F(0), u - half_width - F(0.5)))
-            x1 = math.floor(min(last_x, u + half_width - F(0.5)))
-            y0 = math.ceil(max(F(0), v - half_height - F(0.5)))
-            y1 = math.floor(min(last_y, v + half_height - F(0.5)))
-            if x1 < x0 or y1 < y0:
+            left = min(last_x, max(F(0), u - half_width - F(0.5)))
+            top = min(last_y, max(F(0), v - half_height - F(0.5)))
+            right = min(last_x, u + half_width - F(0.5))
+            bottom = min(last_y, v + half_height - F(0.5))
+            # rounded by casts: math.ceil and math.floor are calls
+            x0, y0 = int(left), int(top)
+            x0 += F(x0) < left
+            y0 += F(y0) < top
+            if right < F(x0) or bottom < F(y0):
                 screen[i, 6] = F(-1)
                 continue
-            from_x, to_x = int(x0) // TILE, int(x1) // TILE + 1
-            from_y, to_y = int(y0) // TILE, int(y1) // TILE + 1
+            from_x, to_x = x0 // TILE, int(right) // TILE + 1
+            from_y, to_y = y0 // TILE, int(bottom) // TILE + 1
             bounds[i, 0] = from_x
             bounds[i, 1] = to_x
             bounds[i, 2] = from_y
@@ -129,48 +133,60 @@ def order_by_depth(depth_bits, count):  # type: ignore[no-untyped-def]
     return order
 
 
+@njit(parallel=True, cache=True, error_model="numpy")
+def list_tiles(  # type: ignore[no-untyped-def]
+    screen: Floats, bounds: Ints, first_slot: Ints, tiles_x: int, alpha_cut: np.float32,
+    tile_of_slot: Ints,
+):  # fmt: skip
+    """The tiles that each Gaussian touches, in raster order.
+
+    Args:
+        bounds, first_slot: from `count_tiles`, and the sums of its counts before each Gaussian.
+        tile_of_slot: [M] output.
+    """
+    number = bounds.shape[0]
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            slot, after = first_slot[i], first_slot[i + 1]
+            if slot == after:
+                continue
+            whole = (bounds[i, 1] - bounds[i, 0]) * (bounds[i, 3] - bounds[i, 2]) == after - slot
+            u, v, a, b, c = screen[i, 0], screen[i, 1], screen[i, 2], screen[i, 3], screen[i, 4]
+            reach = F(2) * math.log(screen[i, 5] / alpha_cut) if not whole else F(0)
+            for ty in range(bounds[i, 2], bounds[i, 3]):
+                dy = F(ty * TILE) + F(0.5) - v
+                for tx in range(bounds[i, 0], bounds[i, 1]):
+                    dx = F(tx * TILE) + F(0.5) - u
+                    if slot < after and (
+                        whole
+                        or _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach)
+                    ):
+                        tile_of_slot[slot] = ty * tiles_x + tx
+                        slot += 1
+
+
 @njit(cache=True, error_model="numpy")
-def fill_tiles(  # type: ignore[no-untyped-def]
-    screen, order, bounds, count, tiles_x, tiles_y, alpha_cut
-):
+def fill_tiles(order, first_slot, tile_of_slot, tiles):  # type: ignore[no-untyped-def]
     """List the Gaussians of every tile, nearest first.
+
+    Args:
+        order: from `order_by_depth`.
+        first_slot, tile_of_slot: from `list_tiles`.
+        tiles: number of tiles.
 
     Returns:
         offsets: [tiles + 1] int32, where each tile's part of `members` begins.
         members: [M] int32, Gaussians by tile.
-        first_slot: [N + 1] int32, where each Gaussian's part of `slots` begins.
         slots: [M] int32, positions in `members` by Gaussian, tiles in raster order.
     """
-    number = count.shape[0]
-    first_slot = np.empty(number + 1, np.int32)
-    total = 0
-    for i in range(number):
-        first_slot[i] = total
-        total += count[i]
-    first_slot[number] = total
-    offsets = np.zeros(tiles_x * tiles_y + 1, np.int32)
-    members = np.empty(total, np.int32)
-    slots = np.empty(total, np.int32)
-    tile_of_slot = np.empty(total, np.int32)
-    for k in range(order.shape[0]):
-        i = order[k]
-        slot = first_slot[i]
-        whole = (bounds[i, 1] - bounds[i, 0]) * (bounds[i, 3] - bounds[i, 2]) == count[i]
-        u, v, a, b, c = screen[i, 0], screen[i, 1], screen[i, 2], screen[i, 3], screen[i, 4]
-        reach = F(2) * math.log(screen[i, 5] / alpha_cut) if not whole else F(0)
-        for ty in range(bounds[i, 2], bounds[i, 3]):
-            dy = F(ty * TILE) + F(0.5) - v
-            for tx in range(bounds[i, 0], bounds[i, 1]):
-                dx = F(tx * TILE) + F(0.5) - u
-                if slot < first_slot[i + 1] and (
-                    whole or _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach)
-                ):
-                    tile_of_slot[slot] = ty * tiles_x + tx
-                    offsets[ty * tiles_x + tx + 1] += 1
-                    slot += 1
-    for tile in range(tiles_x * tiles_y):
+    offsets = np.zeros(tiles + 1, np.int32)
+    for slot in range(tile_of_slot.shape[0]):
+        offsets[tile_of_slot[slot] + 1] += 1
+    for tile in range(tiles):
         offsets[tile + 1] += offsets[tile]
     position = offsets[:-1].copy()
+    members = np.empty_like(tile_of_slot)
+    slots = np.empty_like(tile_of_slot)
     for k in range(order.shape[0]):
         i = order[k]
         for slot in range(first_slot[i], first_slot[i + 1]):
@@ -178,4 +194,4 @@ def fill_tiles(  # type: ignore[no-untyped-def]
             slots[slot] = position[tile]
             members[position[tile]] = i
             position[tile] += 1
-    return offsets, members, first_slot, slots
+    return offsets, members, slots

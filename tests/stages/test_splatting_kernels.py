@@ -140,14 +140,22 @@ def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
     scene = gaussians(2000, 5)
     packed = pack(scene.means, scene.quats_wxyz, scene.log_scales, scene.logit_opacities, scene.sh)
     rng = np.random.default_rng(5)
-    d_planes = rng.normal(size=(4, HEIGHT, WIDTH)).astype(np.float32)
+    given = rng.normal(size=(2000, 7)).astype(np.float32)
+    mask = rng.random((HEIGHT, WIDTH)) < 0.9
+    d_planes = rng.normal(size=(11, HEIGHT, WIDTH)).astype(np.float32)
     d_left = rng.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
     results = []
     for threads in (1, 2):
         use_threads(threads)
-        rendering = rasterize(packed, Viewpoint.of(camera()), degree=3, near=0.1, depth=True)
+        rendering = rasterize(
+            packed, Viewpoint.of(camera()), degree=3, near=0.1, depth=True, features=given,
+            antialiased=True, mask=mask,
+        )  # fmt: skip
         gradients = rendering.backward(d_planes, d_left)
-        results.append((rendering.planes, gradients.packed, gradients.pose, gradients.absolute))
+        results.append(
+            (rendering.planes, gradients.packed, gradients.pose, gradients.focal,
+             gradients.absolute, gradients.features, gradients.opacities)
+        )  # fmt: skip
     for one, two in zip(*results, strict=True):
         assert one.tobytes() == two.tobytes()
 
