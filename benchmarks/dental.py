@@ -171,6 +171,52 @@ def rotation_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> Array:
     return np.degrees([Rotation.from_matrix(matrix).magnitude() for matrix in relative])
 
 
+def epipolar_errors(case: Case, teeth: Teeth) -> tuple[float, float]:
+    """Median Sampson distance in pixels of landmarks seen in two neighbouring photographs, under
+    the cameras found and under the true (or reference) ones."""
+    seen = [
+        _landmarks(dentition, placed)
+        for dentition, placed in zip(teeth.dentitions, teeth.fit.views, strict=True)
+    ]
+    found: list[Array] = []
+    truth: list[Array] = []
+    for i in range(len(seen) - 1):
+        shared = sorted(set(seen[i]) & set(seen[i + 1]))
+        ends = [np.array([seen[k][name] for name in shared]).reshape(-1, 2) for k in (i, i + 1)]
+        ours = [_camera(placed) for placed in teeth.fit.views[i : i + 2]]
+        found.append(_sampson(*ours, *ends))
+        truth.append(_sampson(*case.cameras[i : i + 2], *ends))
+    return float(np.median(np.concatenate(found))), float(np.median(np.concatenate(truth)))
+
+
+def _landmarks(dentition: Dentition, placed: PlacedView) -> dict[tuple[str, int], Array]:
+    """Zeniths and papillae by tooth."""
+    found: dict[tuple[str, int], Array] = {}
+    for jaw in ("upper", "lower"):
+        for crown, tooth in zip(dentition.crowns(jaw), placed.teeth(jaw), strict=True):
+            if tooth and not (crown.cut_left or crown.cut_right or crown.doubtful):
+                found["zenith", tooth] = crown.zenith
+            if tooth and crown.papilla_right is not None:
+                found["papilla", tooth] = crown.papilla_right
+    return found
+
+
+def _camera(placed: PlacedView) -> Camera:
+    centre = (SIZE[0] / 2, SIZE[1] / 2)
+    return Camera("", *SIZE, placed.focal, placed.focal, *centre, placed.cam_from_world)
+
+
+def _sampson(first: Camera, second: Camera, one: Array, other: Array) -> Array:
+    relative = second.cam_from_world @ np.linalg.inv(first.cam_from_world)
+    x, y, z = relative[:3, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
+    fundamental = np.linalg.inv(second.matrix).T @ essential @ np.linalg.inv(first.matrix)
+    one, other = (np.column_stack([p, np.ones(len(p))]) for p in (one, other))
+    lines, back = one @ fundamental.T, other @ fundamental
+    slope = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+    return np.abs((lines * other).sum(1)) / slope
+
+
 def surface_scores(case: Case, scan: Scan, teeth: Teeth) -> tuple[float, float, float, float]:
     """Median and 90 % of the distance of tooth depths to the scan after similarity and ICP, mm;
     share within 1 mm; share of the tooth pixels that have depth."""
@@ -180,8 +226,7 @@ def surface_scores(case: Case, scan: Scan, teeth: Teeth) -> tuple[float, float, 
     ):
         if view is None or dentition is None or placed is None:
             continue
-        ours = Camera("", *SIZE, placed.focal, placed.focal, SIZE[0] / 2, SIZE[1] / 2,
-                      placed.cam_from_world)  # fmt: skip
+        ours = _camera(placed)
         ids, points = scan.look(camera)
         tooth = _tooth_pixels(case, ids, dentition)
         covered += int((tooth & (view.depth > 0)).sum())
@@ -205,7 +250,7 @@ def surface_scores(case: Case, scan: Scan, teeth: Teeth) -> tuple[float, float, 
     )  # fmt: skip
 
 
-def _tooth_pixels(case: Case, ids: npt.NDArray[np.int64], dentition: Dentition):  # type: ignore[no-untyped-def]
+def _tooth_pixels(case, ids, dentition):  # type: ignore[no-untyped-def]
     """Where the photograph shows teeth: by the scan where the camera is exact, else as found."""
     tooth = dentition.mask if case.name == PHOTOS else ids > 0
     return cv2.erode(tooth.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -232,20 +277,24 @@ def _best(source: Array, target: Array, motion):  # type: ignore[no-untyped-def]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, help="folder with scan_video_a, dental_photos_a")
     parser.add_argument("--only", default="", help="one set, as 001,012,022 or 'photos'")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--pictures", type=Path, help="where to write the pictures")
     options = parser.parse_args()
+    if options.data is None:
+        print("benchmarks/dental.py: nothing to do without --data FOLDER")
+        return
     scan = Scan(options.data / "scan_video_a" / "teeth.ply")
     sets = [*TRIPLES, PHOTOS] if (options.data / "dental_photos_a").is_dir() else [*TRIPLES]
     if options.only:
         sets = [PHOTOS if options.only == "photos" else options.only]
     print(
-        "| set | labels right / wrong / none | margin | rotation, degrees | surface median / p90, "
+        "| set | labels right / wrong / none | margin | rotation, degrees | epipolar error of "
+        "landmarks, px: found / truth | surface median / p90, "
         "mm | within 1 mm | covered | CPU s | wall s |"
     )
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for names in sets:
         case = read_case(options.data, names)
         cpu, wall = time.process_time(), time.perf_counter()
@@ -261,10 +310,14 @@ def main() -> None:
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
         labels = " / ".join(map(str, count_labels(case, scan, teeth)))
         errors = " ".join(f"{error:.1f}" for error in rotation_errors(case, teeth.fit.views))
+        epipolar = " / ".join(f"{error:.1f}" for error in epipolar_errors(case, teeth))
         median, most, within, covered = surface_scores(case, scan, teeth)
-        print(f"| {names} | {labels} | {teeth.fit.margin:.0f} | {errors} | {median:.3f} / "
-              f"{most:.2f} | {100 * within:.0f} % | {100 * covered:.1f} % | {cpu:.1f} | "
-              f"{wall:.1f} |", flush=True)  # fmt: skip
+        cells = (
+            names, labels, f"{teeth.fit.margin:.0f}", errors, epipolar,
+            f"{median:.3f} / {most:.2f}", f"{100 * within:.0f} %", f"{100 * covered:.1f} %",
+            f"{cpu:.1f}", f"{wall:.1f}",
+        )  # fmt: skip
+        print(f"| {' | '.join(cells)} |", flush=True)
         if options.pictures:
             options.pictures.mkdir(parents=True, exist_ok=True)
             for name in ("teeth", "turned"):
