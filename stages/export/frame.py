@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.points import Points
 
 Array = npt.NDArray[np.float64]
@@ -91,7 +91,15 @@ def move_gaussians(gaussians: Gaussians, similarity: Array) -> Gaussians:
         log_scales=(gaussians.log_scales + np.float32(np.log(scale))).astype(np.float32),
         logit_opacities=gaussians.logit_opacities,
         sh=sh.astype(np.float32),
+        light=_moved_light(gaussians.light, scale, rotation),
     )
+
+
+def _moved_light(light: Light | None, scale: float, rotation: Array) -> Light | None:
+    if light is None:
+        return None
+    normals = (light.normals @ rotation.T).astype(np.float32)
+    return replace(light, normals=normals, distance=scale * light.distance)
 
 
 def move_cameras(cameras: Iterable[Camera], similarity: Array) -> tuple[Camera, ...]:

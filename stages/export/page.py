@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.gaussians import Gaussians, Light
 from stages.export.orbits import Orbit
-from stages.export.splats import PER_ROW, pack, texels, used_degree, visible
+from stages.export.splats import PER_ROW, pack, texels, used_degree, visible, with_material
 
 HERE = Path(__file__).parent
 SCRIPTS = ("camera.js", "sort.js", "renderer.js", "viewer.js", "controls.js")
@@ -68,6 +68,19 @@ def describe_orbit(orbit: Orbit) -> dict[str, Any]:
     }
 
 
+def describe_light(light: Light | None, orbit: Orbit) -> dict[str, Any] | None:
+    """The light as the shader takes it, and the distances that the photographs were taken from."""
+    if light is None:
+        return None
+    (narrow, broad), (strong, weak) = light.widths, light.strengths
+    return {
+        "globals": [light.diffuse_share, light.falloff, narrow, strong, broad, weak,
+                    light.distance, light.gamma],
+        "centre": orbit.centre.tolist(),
+        "distances": [float(orbit.distances.min()), float(orbit.distances.max())],
+    }  # fmt: skip
+
+
 def rasterizer_constants(gaussians: Gaussians, cameras: Sequence[Camera]) -> dict[str, float]:
     """The constants of our rasterizer, with its near plane for a typical camera of the scene."""
     from stages.splatting.raster import ALPHA_MAX
@@ -111,11 +124,14 @@ def build_page(
         The text of a self-contained HTML file: no names, no paths, no network.
     """
     shown = visible(gaussians, rasterizer["alpha_min"])
+    light = gaussians.light
     kept = Gaussians(
         gaussians.means[shown], gaussians.quats_wxyz[shown], gaussians.log_scales[shown],
-        gaussians.logit_opacities[shown], gaussians.sh[shown],
+        gaussians.logit_opacities[shown], gaussians.sh[shown], light[shown] if light else None,
     )  # fmt: skip
     degree = min(sh_degree, used_degree(kept))
+    if light:
+        kept, degree = with_material(kept), 1
     views = []
     for camera in cameras:
         view = describe_camera(camera)
@@ -125,7 +141,7 @@ def build_page(
     scene = {
         "format": {
             "count": len(kept), "sh_degree": degree, "texels": texels(degree), "per_row": PER_ROW,
-            "rasterizer": dict(rasterizer),
+            "rasterizer": dict(rasterizer), "light": describe_light(light, orbit),
         },
         "orbiting": describe_orbit(orbit),
         "views": views,

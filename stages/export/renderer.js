@@ -16,7 +16,7 @@ class SplatRenderer {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {{count: number, sh_degree: number, texels: number, per_row: number,
-   *   rasterizer: object}} format of the packed splats
+   *   rasterizer: object, light: ?object}} format of the packed splats
    * @param {Uint32Array} packed
    * @param {Record<string, string>} shaders GLSL by file name
    */
@@ -40,7 +40,7 @@ class SplatRenderer {
       ?? gl.getExtension("EXT_color_buffer_half_float"));
     const { texels, per_row: perRow, sh_degree: degree, rasterizer: r } = this.format;
     const defines = {
-      TEXELS: texels, PER_ROW: perRow, SH_DEGREE: degree, LOW_PASS: r.low_pass.toFixed(6),
+      TEXELS: texels, PER_ROW: perRow, SH_DEGREE: degree, LIT: this.format.light ? 1 : 0, LOW_PASS: r.low_pass.toFixed(6),
       ALPHA_MIN: r.alpha_min.toFixed(9), ALPHA_MAX: r.alpha_max.toFixed(6),
     };
     this.splatProgram = this.#program("splat.vert.glsl", "splat.frag.glsl", defines);
@@ -142,6 +142,13 @@ class SplatRenderer {
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
   }
 
+  /** Nearer or farther than the photographs, the light must neither glare nor go out. */
+  #exposure(eye) {
+    const { globals, centre, distances: [nearest, farthest] } = this.format.light;
+    const distance = Math.hypot(...eye.map((value, axis) => value - centre[axis]));
+    return (distance / Math.min(Math.max(distance, nearest), farthest)) ** globals[1];
+  }
+
   /**
    * Draw into the canvas, whose size in pixels is that of the pose.
    * @param {Pose} pose @param {number[]} background rgb in 0..1
@@ -173,6 +180,10 @@ class SplatRenderer {
     gl.uniform2f(u.u_slope_max,
       ((1 + margin) * width - cx) / fx, ((1 + margin) * height - cy) / fy);
     gl.uniform1f(u.u_near, near);
+    if (this.format.light) {
+      gl.uniform1fv(u["u_light[0]"] ?? u.u_light, this.format.light.globals);
+      gl.uniform1f(u.u_exposure, this.#exposure(centreOf(R, t)));
+    }
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.order.length);
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

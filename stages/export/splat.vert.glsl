@@ -16,6 +16,10 @@ uniform vec2 u_size;              // viewport in pixels
 uniform vec2 u_slope_min;         // bounds of x/z and y/z in the Jacobian
 uniform vec2 u_slope_max;
 uniform float u_near;
+#if LIT
+uniform float u_light[8];         // k, p, m and s of both lobes, distance, gamma: light.py
+uniform float u_exposure;
+#endif
 
 in uint a_splat;
 
@@ -62,8 +66,24 @@ vec3 coefficient(uvec4 shape, int k) {
 }
 #endif
 
-vec3 colour(uvec4 shape, vec3 d) {
+#if LIT
+// stages/splatting/light.py: one light beside the lens, on albedo (in c) and normal.
+vec3 lit(uvec4 shape, vec3 c, vec3 to_eye, float distance) {
+  float cosine = dot(normalize(coefficient(shape, 1)), to_eye);
+  float fall = u_exposure * pow(u_light[6] / distance, u_light[1]);
+  float diffuse = 1.0 - u_light[0] + u_light[0] * max(cosine, 0.0);
+  float lobes = u_light[3] * exp(u_light[2] * (cosine - 1.0))
+      + u_light[5] * exp(u_light[4] * (cosine - 1.0));
+  vec3 radiance = fall * (pow(max(c, 1e-3), vec3(u_light[7])) * diffuse + lobes);
+  return pow(max(radiance, 1e-5), vec3(1.0 / u_light[7]));
+}
+#endif
+
+vec3 colour(uvec4 shape, vec3 d, float distance) {
   vec3 c = 0.5 + 0.28209479177387814 * vec3(unpackHalf2x16(shape.z), unpackHalf2x16(shape.w).x);
+#if LIT
+  return lit(shape, c, -d, distance);
+#endif
 #if SH_DEGREE > 0
   c += 0.4886025119029199 * (-d.y * coefficient(shape, 1) + d.z * coefficient(shape, 2)
       - d.x * coefficient(shape, 3));
@@ -131,5 +151,6 @@ void main() {
   vec2 pixel = u_focal * p.xy / p.z + u_principal
       + axis * (sqrt(major) * v_offset.x) + vec2(-axis.y, axis.x) * (sqrt(minor) * v_offset.y);
   gl_Position = vec4(2.0 * pixel.x / u_size.x - 1.0, 1.0 - 2.0 * pixel.y / u_size.y, 0.0, 1.0);
-  v_colour = vec4(colour(shape, normalize(mean - u_centre)), opacity);
+  vec3 ray = mean - u_centre;
+  v_colour = vec4(colour(shape, normalize(ray), length(ray)), opacity);
 }

@@ -15,9 +15,14 @@ texel  word content
 ====== ==== ====================================================================================
 
 That is 32, 48, 80 or 128 bytes a splat for degree 0, 1, 2, 3.
+
+Where a light beside the lens lit the scene, f_dc holds the albedo (as .5 + C0 f_dc), the rest the
+normal, in the texels of degree 1; the shader does what `stages.splatting.light` does.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +31,8 @@ from pipeline.artifacts.gaussians import Gaussians
 
 #: Splats in a row of the texture; times 8 texels it is the 4096 that every WebGL2 device can do.
 PER_ROW = 512
+#: Colour = .5 + this * f_dc.
+CONSTANT_HARMONIC = 0.28209479177387814
 
 
 def coefficients(degree: int) -> int:
@@ -71,6 +78,16 @@ def pack_quaternions(quats_wxyz: npt.NDArray[np.floating]) -> npt.NDArray[np.uin
     levels = np.clip(np.rint(share * 1023), 0, 1023).astype(np.uint32)
     packed = levels[:, 0] | levels[:, 1] << np.uint32(10) | levels[:, 2] << np.uint32(20)
     return packed | largest.astype(np.uint32) << np.uint32(30)
+
+
+def with_material(gaussians: Gaussians) -> Gaussians:
+    """Albedo and normal in the place of the harmonics, for Gaussians with a light."""
+    light = gaussians.light
+    assert light is not None
+    sh = np.zeros_like(gaussians.sh)
+    sh[:, 0] = (light.albedo - 0.5) / CONSTANT_HARMONIC
+    sh[:, 1] = light.normals / np.linalg.norm(light.normals, axis=1, keepdims=True)
+    return replace(gaussians, sh=sh)
 
 
 def pack(gaussians: Gaussians, degree: int) -> npt.NDArray[np.uint32]:

@@ -16,19 +16,16 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from stages.fit.floaters import before_lens, contribution
-from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, thin
+from stages.fit.initial import Frame
+from stages.fit.lighting import choose_light, harmonics_for_viewers
+from stages.fit.objectives import logit
+from stages.fit.scene import prepare
 from stages.fit.settings import FitSettings
-from stages.fit.targets import make_pyramids
-from stages.fit.trainer import Trainer, logit
+from stages.fit.trainer import Trainer
 from stages.splatting.rasterizer import unpack, use_threads
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
-
-#: scene extent: this times the largest distance of a camera from their middle (3DGS), at least
-#: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
-EXTENT_MARGIN = 1.1
-MIN_EXTENT = 0.25
 
 
 @dataclass(frozen=True)
@@ -39,6 +36,9 @@ class FitResult:
     psnr, ssim: [V] of the training views at full size.
     pruned: Gaussians removed at the end.
     flow_pairs: pairs that the flow loss used.
+    light: ``"camera"`` or ``"none"``, what was used.
+    surface_held: Gaussians were held to the surface of the points.
+    light_figures: PSNR of the held-out photograph in the trials, where there were any.
     """
 
     gaussians: Gaussians
@@ -47,6 +47,9 @@ class FitResult:
     ssim: Array
     pruned: int
     flow_pairs: int
+    light: str
+    light_figures: dict[str, float]
+    surface_held: bool
 
 
 def fit(
@@ -59,6 +62,7 @@ def fit(
     threads: int,
     checkpoint: Path | None,
     report: Callable[[int, float, float, int], None],
+    diary: Path | None = None,
 ) -> FitResult:
     """Fit Gaussians and poses.
 
@@ -70,65 +74,52 @@ def fit(
         threads: never changes the result.
         checkpoint: file to save the state to and to start from, or None.
         report: called with iteration, loss, PSNR and number of Gaussians.
+        diary: folder for the loss curve and previews, or None.
 
     Raises:
         ReconstructionError: the fit diverged, or nothing is left of it.
     """
     use_threads(threads)
-    frame = choose_frame(points.positions.astype(np.float64), cameras)
-    local_cameras = [in_frame(camera, frame) for camera in cameras]
-    cloud = Cloud(
-        frame.points(points.positions), points.colors.astype(np.float64),
-        points.normals.astype(np.float64), np.maximum(points.confidence, 1).astype(np.float64),
-    )  # fmt: skip
-    packed = initial_gaussians(
-        thin(cloud, settings.initial_points), local_cameras, opacity=settings.initial_opacity,
-        scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
-        degree=settings.sh_degree, headlight=settings.headlight,
-    )  # fmt: skip
-    centres = np.array([camera.centre for camera in local_cameras])
-    middle = np.linalg.norm(centres - centres.mean(0), axis=1)
-    flows = chosen_flows(views, flow) if settings.lambda_flow > 0 else {}
-    factors = [1, settings.coarse_factor] if settings.coarse_fraction > 0 else [1]
-    targets = make_pyramids(
-        [view.image for view in views], [view.valid() for view in views], local_cameras, factors,
-        cloud.positions if settings.lambda_depth > 0 else None, flows,
-    )  # fmt: skip
-    trainer = Trainer(
-        packed, np.array([camera.cam_from_world[:3] for camera in local_cameras]),
-        int(middle.argmin()), targets, max(EXTENT_MARGIN * float(middle.max()), MIN_EXTENT),
-        settings,
-    )  # fmt: skip
-    trainer.run(checkpoint, report)
-    if not np.isfinite(trainer.packed).all():
-        raise ReconstructionError(
-            "The fit diverged: some Gaussians are not finite. Lower the learning rates "
-            "(fit.feature_lr, fit.scaling_lr, fit.pose_lr_init)."
-        )
-    keep = worth_keeping(trainer, cloud.positions)
+    scene = prepare(views, cameras, points, flow, settings)
+    light = settings.light
+    figures: dict[str, float] = {}
+    if light == "auto":
+        light, figures = choose_light(scene, settings)
+    lit = light == "camera"
+    trainer = scene.trainer(settings, lit)
+    trainer.run(checkpoint, report, diary)
+    keep = worth_keeping(trainer, scene.cloud.positions)
     if not keep.any():
         raise ReconstructionError(
             "Nothing is left of the fit: no Gaussian colours any photograph. The points and the "
             "cameras that it started from don't agree; look at what align and sap made of them."
         )
     before = len(trainer.packed)
-    trainer.packed = np.ascontiguousarray(trainer.packed[keep])
-    psnr, ssim = trainer.training_scores()
-    poses = trainer.poses.poses
-    refined = [
-        replace(camera, cam_from_world=frame.cam_from_world(pose)) if moved else camera
-        for camera, pose, moved in zip(cameras, poses, trainer.poses.steps > 0, strict=True)
-    ]
-    return FitResult(
-        to_world(unpack(trainer.packed), frame), tuple(refined), psnr, ssim,
-        before - len(trainer.packed), len(flows),
+    trainer.replace(
+        np.ascontiguousarray(trainer.packed[keep]), np.flatnonzero(keep),
+        np.zeros(int(keep.sum()), bool),
     )  # fmt: skip
-
-
-def in_frame(camera: Camera, frame: Frame) -> Camera:
-    matrix = np.eye(4)
-    matrix[:3] = frame.pose(camera.cam_from_world)
-    return replace(camera, cam_from_world=matrix)
+    psnr, ssim = trainer.training_scores()
+    gaussians = unpack(trainer.packed)
+    if trainer.light is not None:
+        gaussians = replace(
+            unpack(harmonics_for_viewers(trainer, scene.cameras).packed),
+            light=trainer.light.light(scene.frame.scale),
+        )
+    poses = trainer.poses.poses
+    factor = float(np.exp(trainer.focal.log_factor))
+    refined = [
+        replace(
+            camera, fx=camera.fx * factor, fy=camera.fy * factor,
+            cam_from_world=scene.frame.cam_from_world(pose) if moved else camera.cam_from_world,
+        )
+        for camera, pose, moved in zip(cameras, poses, trainer.poses.steps > 0, strict=True)
+    ]  # fmt: skip
+    return FitResult(
+        to_world(gaussians, scene.frame), tuple(refined), psnr, ssim,
+        before - len(trainer.packed), len(scene.flows), light, figures,
+        trainer.held_surface is not None,
+    )  # fmt: skip
 
 
 def to_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
@@ -138,20 +129,6 @@ def to_world(gaussians: Gaussians, frame: Frame) -> Gaussians:
         means=means.astype(np.float32),
         log_scales=gaussians.log_scales + np.float32(np.log(frame.scale)),
     )
-
-
-def chosen_flows(
-    views: Sequence[View], flow: Flow | None
-) -> dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]:
-    """For each placed view its flow to another placed one: (index of that, flow, mask)."""
-    index = {view.name: position for position, view in enumerate(views)}
-    chosen: dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]] = {}
-    for pair in flow.pairs if flow is not None else ():
-        i, j = index.get(pair.name_i), index.get(pair.name_j)
-        if i is None or j is None or i in chosen or not pair.mask_forward.any():
-            continue
-        chosen[i] = (j, pair.forward, pair.mask_forward)
-    return chosen
 
 
 def worth_keeping(trainer: Trainer, positions: Array) -> npt.NDArray[np.bool_]:

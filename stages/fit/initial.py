@@ -19,7 +19,10 @@ SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
 
 @dataclass(frozen=True)
 class Cloud:
-    """Attributes: positions, colors, normals [N, 3] (normals unit or 0), weight [N]; float64."""
+    """Attributes:
+    positions, colors, normals: [N, 3] float64; normals unit or 0.
+    weight: [N] float64, raw confidence, >= 1.
+    """
 
     positions: Array
     colors: Array
@@ -28,6 +31,11 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def select(self, index: npt.NDArray[np.bool_]) -> Cloud:
+        return Cloud(
+            self.positions[index], self.colors[index], self.normals[index], self.weight[index]
+        )
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,8 @@ def thin(cloud: Cloud, target: int) -> Cloud:
     normals = mean(cloud.normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 0.2, normals / np.maximum(length, 1e-12), 0)
-    return Cloud(mean(cloud.positions), mean(cloud.colors), normals, mass)
+    confidence = mean(cloud.weight[:, None])[:, 0]
+    return Cloud(mean(cloud.positions), mean(cloud.colors), normals, confidence)
 
 
 def neighbour_spacing(positions: Array) -> Array:
@@ -117,6 +126,20 @@ def neighbour_spacing(positions: Array) -> Array:
         return np.full(len(positions), 1e-2)
     distance, _ = cKDTree(positions).query(positions, k=4)
     return np.sqrt(np.maximum((distance[:, 1:] ** 2).mean(1), 1e-7 * np.median(distance) ** 2))
+
+
+def smooth_normals(cloud: Cloud, neighbours: int) -> Cloud:
+    """Normals averaged over so many neighbours, weighted by confidence; 0 or 1: as they are."""
+    if neighbours < 2 or len(cloud) < neighbours:
+        return cloud
+    _, index = cKDTree(cloud.positions).query(cloud.positions, k=neighbours)
+    weight = cloud.weight[index]
+    # what looks away is another surface
+    weight = weight * ((cloud.normals[index] * cloud.normals[:, None]).sum(-1) > 0.3)
+    mean = (cloud.normals[index] * weight[..., None]).sum(1)
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    normals = np.where(length > 1e-9, mean / np.maximum(length, 1e-9), cloud.normals)
+    return Cloud(cloud.positions, cloud.colors, normals, cloud.weight)
 
 
 def facing(positions: Array, normals: Array, cameras: Sequence[Camera]) -> Array:
@@ -157,8 +180,7 @@ def initial_gaussians(
         scale: standard deviation as a multiple of the neighbours' spacing.
         scale_max_px: its largest value, in pixels of the nearest camera.
         degree: of the harmonics.
-        headlight: share k of the light that comes from the camera: colour = albedo (1 - k + k n.v),
-            which is exactly degree 1 in the direction of view (the flash moves with the camera).
+        headlight: share of the light that comes from the camera (see `headlight_harmonics`).
     """
     count, terms = len(cloud), (degree + 1) ** 2
     spacing = neighbour_spacing(cloud.positions)
@@ -172,17 +194,35 @@ def initial_gaussians(
     packed[:, 3] = 1
     packed[:, 7:10] = np.log(sigma)[:, None]
     packed[:, 10] = np.log(opacity / (1 - opacity))
-    constant = cloud.colors - 0.5
+    cosine = facing(cloud.positions, cloud.normals, cameras)
+    sh = headlight_harmonics(cloud.colors, cloud.normals, cosine, headlight, degree)
+    packed[:, 11:] = sh.reshape(count, -1)
+    return np.ascontiguousarray(packed, np.float32)
+
+
+def headlight_harmonics(
+    colors: Array, normals: Array, cosine: Array, headlight: float, degree: int
+) -> Array:
+    """Spherical harmonics [N, K, 3] of a matte surface lit from the camera.
+
+    Colour = albedo (1 - k + k n.v) is exactly of degree 1 in the direction of view.
+
+    Args:
+        colors: [N, 3] as seen at `cosine` [N].
+        normals: [N, 3] unit, or 0 where unknown: the same colour from everywhere.
+        headlight: the share k.
+        degree: of the harmonics; at 0 the colours as they are.
+    """
+    sh = np.zeros((len(colors), (degree + 1) ** 2, 3))
+    constant = colors - 0.5
     if degree > 0 and headlight > 0:
-        known = (np.abs(cloud.normals).sum(1) > 0)[:, None]
-        cosine = facing(cloud.positions, cloud.normals, cameras)[:, None]
-        directed = np.where(
-            known, headlight * cloud.colors / (1 - headlight + headlight * cosine), 0
-        )
+        known = (np.abs(normals).sum(1) > 0)[:, None]
+        cosine = cosine[:, None]
+        directed = np.where(known, headlight * colors / (1 - headlight + headlight * cosine), 0)
         constant = constant - directed * cosine
         # basis of degree 1 along d = -v is (-y, z, -x) C1, and n.v = -n.d
-        packed[:, 14:17] = directed * cloud.normals[:, 1:2] / SH_C1
-        packed[:, 17:20] = -directed * cloud.normals[:, 2:3] / SH_C1
-        packed[:, 20:23] = directed * cloud.normals[:, 0:1] / SH_C1
-    packed[:, 11:14] = constant / SH_C0
-    return np.ascontiguousarray(packed, np.float32)
+        sh[:, 1] = directed * normals[:, 1:2] / SH_C1
+        sh[:, 2] = -directed * normals[:, 2:3] / SH_C1
+        sh[:, 3] = directed * normals[:, 0:1] / SH_C1
+    sh[:, 0] = constant / SH_C0
+    return sh

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
 
 
 def skew(vector: Array) -> Array:
@@ -60,3 +61,40 @@ class PoseOptimizer:
         u, _, vt = np.linalg.svd(moved[:, :3])
         moved[:, :3] = u @ vt
         self.poses[view] = moved
+
+
+class SharedFocal:
+    """Adam on one factor of all focal lengths.
+
+    Attributes:
+        log_factor: its logarithm.
+    """
+
+    def __init__(self) -> None:
+        self.log_factor = self.first = self.second = 0.0
+        self.steps = 0
+
+    def apply(self, intrinsics: Floats) -> Floats:
+        """[4] fx, fy, cx, cy with the factor."""
+        if self.log_factor == 0:
+            return intrinsics
+        factor = np.float32(np.exp(self.log_factor))
+        return intrinsics * np.array([factor, factor, 1, 1], np.float32)
+
+    def step(self, gradient: Array, intrinsics: Floats, rate: float) -> None:
+        """Move against the gradient [2] of fx and fy of a view whose intrinsics [4] were used."""
+        by_log = float(gradient @ intrinsics[:2].astype(np.float64))
+        self.steps += 1
+        self.first = 0.9 * self.first + 0.1 * by_log
+        self.second = 0.999 * self.second + 0.001 * by_log**2
+        mean = self.first / (1 - 0.9**self.steps)
+        spread = (self.second / (1 - 0.999**self.steps)) ** 0.5
+        self.log_factor -= rate * mean / (spread + 1e-15)
+
+    def state(self) -> list[float]:
+        return [self.log_factor, self.first, self.second, self.steps]
+
+    def restore(self, state: list[float]) -> None:
+        """Take up what `state` gave."""
+        self.log_factor, self.first, self.second = state[:3]
+        self.steps = int(state[3])

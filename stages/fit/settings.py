@@ -11,16 +11,43 @@ MANY_VIEWS = 6
 
 @dataclass(frozen=True)
 class FitSettings:
-    """See `stage.FitConfig` for what each field means; here nothing is ``"auto"`` any more."""
+    """See `config.FitConfig` for what each field means.
+
+    What depends on the number of views is not ``"auto"`` any more; `light` and `hold_surface` may
+    be: they depend on the scene.
+    """
 
     iterations: int
     initial_points: int
+    trusted_confidence: float
+    fill_tolerance: float
+    fill_share: float
+    normal_neighbours: int
+    saturation: float
     initial_opacity: float
     initial_scale: float
     initial_scale_max_px: float
     sh_degree: int
     sh_degree_interval: int
     headlight: float
+    light: str
+    light_diffuse: float
+    light_falloff: float
+    light_widths: tuple[float, float]
+    light_strengths: tuple[float, float]
+    light_gamma: float
+    light_albedo_lr: float
+    light_normal_lr: float
+    light_lr: float
+    light_falloff_lr: float
+    light_strength_lr: float
+    light_lr_decay: float
+    light_sh_iterations: int
+    light_sh_rest_lr: float
+    light_trial_iterations: int
+    light_trial_points: int
+    light_trial_factor: int
+    light_margin: float
     lambda_dssim: float
     lambda_flow: float
     lambda_depth: float
@@ -37,9 +64,22 @@ class FitSettings:
     pose_lr_init: float
     pose_lr_final: float
     pose_from_iter: int
+    optimize_focal: bool
+    focal_lr: float
     exposure: bool
     exposure_lr: float
+    isotropic: bool
+    hold_surface: bool | str
+    hold_min_angle: float
+    hold_strength: float
+    hold_flatness: float
+    hold_growth: float
+    hold_colors_until: float
     densify: bool
+    strategy: str
+    noise_lr: float
+    opacity_reg: float
+    scale_reg: float
     absgrad: str
     densify_from_iter: int
     densify_until_iter: int
@@ -56,6 +96,8 @@ class FitSettings:
     near: float
     background: tuple[float, float, float]
     seed: int
+    divergence_factor: float
+    preview_every: int
     checkpoint_every: int
 
 
@@ -73,12 +115,13 @@ def automatic(views: int) -> dict[str, Any]:
         "initial_points": 30000 if many else 15000,
         "feature_lr": 2.5e-3 * rate,
         "feature_rest_lr": 2.5e-3 / 20 * rate,
+        # in colour, not in harmonics: C0 times as much
+        "light_albedo_lr": 7e-4 * rate,
         "scaling_lr": 5e-3 * rate,
         "rotation_lr": 1e-3 * rate,
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
-        # with many views the photographs know better than the points
-        "lambda_depth": 0.1 if many else 0.5,
+        "lambda_depth": 0.3 if many else 0.5,
         "pose_lr_init": 3e-4,
         "pose_lr_final": 3e-6,
     }

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
+from stages.splatting.light import lit_scene
 from stages.splatting.rasterizer import Viewpoint, pack, rasterize, use_threads
 
 Floats = npt.NDArray[np.float32]
@@ -31,6 +32,21 @@ class RenderedView:
     depth: Floats
 
 
+def _as_seen(gaussians: Gaussians, camera: Camera) -> tuple[Floats, int]:
+    """The packed scene, and the degree of its harmonics."""
+    if gaussians.light is not None:
+        return lit_scene(gaussians, camera.centre), 0
+    packed = pack(
+        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
+        gaussians.sh,
+    )  # fmt: skip
+    # trailing harmonics that are zero everywhere cost time and change nothing
+    degree = 3
+    while degree > 0 and not gaussians.sh[:, degree * degree : (degree + 1) ** 2].any():
+        degree -= 1
+    return packed, degree
+
+
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -38,7 +54,7 @@ def render(
     threads: int | None = None,
     near: float | None = None,
 ) -> RenderedView:
-    """Render Gaussians as a camera sees them.
+    """Render Gaussians as a camera sees them, with the light beside it where they have one.
 
     Args:
         gaussians: the scene.
@@ -48,14 +64,7 @@ def render(
         near: near plane in world units; None: 2 % of the median depth in front of the camera.
     """
     use_threads(threads)
-    packed = pack(
-        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
-        gaussians.sh,
-    )  # fmt: skip
-    # trailing harmonics that are zero everywhere cost time and change nothing
-    degree = 3
-    while degree > 0 and not gaussians.sh[:, degree * degree : (degree + 1) ** 2].any():
-        degree -= 1
+    packed, degree = _as_seen(gaussians, camera)
     if near is None:
         z = gaussians.means @ camera.rotation[2].astype(np.float32) + np.float32(
             camera.translation[2]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera, Cameras
-from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from stages.splatting.rendering import render
@@ -52,6 +54,18 @@ def ball_gaussians(count: int = 1500, degree: int = 1) -> Gaussians:
         logit_opacities=random.uniform(1.5, 5.0, count).astype(np.float32),
         sh=sh.astype(np.float32),
     )
+
+
+def lit_ball(count: int = 1500) -> Gaussians:
+    """The ball with a light beside the lens: it says something else than its harmonics."""
+    ball = ball_gaussians(count)
+    normals = ball.means / np.linalg.norm(ball.means, axis=1, keepdims=True)
+    albedo = np.clip(0.5 + 0.4 * normals[:, [1, 2, 0]], 0.05, 0.95).astype(np.float32)
+    light = Light(
+        albedo, normals.astype(np.float32), diffuse_share=0.8, falloff=1.5, distance=3.0,
+        widths=(60.0, 12.0), strengths=(0.5, 0.05),
+    )  # fmt: skip
+    return replace(ball, light=light)
 
 
 def ball_points() -> Points:

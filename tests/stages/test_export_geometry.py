@@ -32,8 +32,10 @@ def similarity(scale: float = 23.0) -> np.ndarray:
     return matrix
 
 
-def test_a_moved_scene_looks_the_same_to_moved_cameras() -> None:
-    gaussians, camera = scene.ball_gaussians(degree=3), scene.ball_cameras()[0]
+@pytest.mark.parametrize("lit", [False, True])
+def test_a_moved_scene_looks_the_same_to_moved_cameras(lit: bool) -> None:
+    gaussians = scene.lit_ball() if lit else scene.ball_gaussians(degree=3)
+    camera = scene.ball_cameras()[0]
     before = render(gaussians, camera)
     (moved_camera,) = move_cameras([camera], similarity())
     after = render(move_gaussians(gaussians, similarity()), moved_camera)

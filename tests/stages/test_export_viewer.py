@@ -34,8 +34,9 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(error, 1e-12)))
 
 
-def page(degree: int = 1, photos: bool = True) -> str:
-    gaussians, cameras = scene.ball_gaussians(degree=degree), scene.ball_cameras()
+def page(degree: int = 1, photos: bool = True, gaussians: Gaussians | None = None) -> str:
+    gaussians = gaussians or scene.ball_gaussians(degree=degree)
+    cameras = scene.ball_cameras()
     pictures = {camera.name: to_uint8(render(gaussians, camera).image) for camera in cameras}
     return build_page(
         gaussians, cameras, find_orbit(cameras, [3.0] * 3), pictures if photos else {},
@@ -122,20 +123,22 @@ def test_the_page_is_whole_and_needs_no_network() -> None:
 
 
 @needs_chromium
-def test_a_browser_draws_what_our_rasterizer_draws(tmp_path: Path) -> None:
+@pytest.mark.parametrize("lit", [False, True])
+def test_a_browser_draws_what_our_rasterizer_draws(tmp_path: Path, lit: bool) -> None:
+    gaussians = scene.lit_ball() if lit else scene.ball_gaussians(degree=3)
     file = tmp_path / "viewer.html"
-    file.write_text(page(degree=3))
+    file.write_text(page(gaussians=gaussians))
     shot = tmp_path / "shot.png"
     camera = scene.ball_cameras()[2].resized(640, 480)  # Chromium has no smaller windows than 500
     _, log = browse(file, "#view=3&bare&still", (640, 480), f"--screenshot={shot}")
     assert console(log) == []
     picture = cv2.imread(str(shot))[..., ::-1]
-    expected = to_uint8(render(scene.ball_gaussians(degree=3), camera).image)
+    expected = to_uint8(render(gaussians, camera).image)
     assert picture.shape == expected.shape
     # Ours stops at 1e-4 transmittance and stores 32 bits, the page 16: 55 dB and more when written.
     assert psnr(picture, expected) > 40
-    assert psnr(picture[:, ::-1], expected) < 20, "mirrored"
-    assert psnr(picture[::-1], expected) < 20, "upside down"
+    assert psnr(picture[:, ::-1], expected) < 25, "mirrored"
+    assert psnr(picture[::-1], expected) < 25, "upside down"
 
 
 PROBE = """

@@ -1,0 +1,91 @@
+"""Is there a light beside the lens? And spherical harmonics for viewers that know no such light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.errors import ReconstructionError
+from stages.fit.initial import facing, headlight_harmonics
+from stages.fit.scene import Scene
+from stages.fit.settings import FitSettings
+from stages.fit.trainer import Trainer
+from stages.splatting.projection import HARMONICS
+
+
+def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
+    """Fit all photographs but one, with and without a light, and see which predicts that one.
+
+    The one left out has a neighbour on either side: the model is to fill gaps, not to extrapolate.
+    Small images, few Gaussians and few steps: how the light moves shows long before any detail.
+
+    Returns:
+        ``"camera"`` or ``"none"``, and the PSNR of either on the photograph that was left out.
+    """
+    held = middle_view(scene.cameras)
+    rest = scene.without(held)
+    factor = settings.light_trial_factor
+    trial = replace(
+        settings, iterations=settings.light_trial_iterations,
+        initial_points=settings.light_trial_points, coarse_fraction=1.0, coarse_factor=factor,
+        lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False,
+        opacity_reset_interval=0, sh_degree_interval=0,
+    )  # fmt: skip
+    target = scene.targets[held][factor]
+    camera = scene.cameras[held]
+    scores = {}
+    for name, lit in (("none", False), ("camera", True)):
+        trainer = rest.trainer(trial, lit)
+        try:
+            trainer.run(None, lambda *_: None)
+        except ReconstructionError:  # it diverged; if the fit does as well, it says so
+            scores[name] = 0.0
+            continue
+        image = trainer.picture(camera.cam_from_world[:3], target)
+        scores[name] = target.colour(np.clip(image, 0, 1), settings.lambda_dssim).psnr
+    better = scores["camera"] >= scores["none"] + settings.light_margin
+    figures = {f"light_trial_{name}": round(score, 2) for name, score in scores.items()}
+    return ("camera" if better else "none"), figures
+
+
+def middle_view(cameras: Sequence[Camera]) -> int:
+    """The camera that is nearest to the middle of the others."""
+    centres = np.array([camera.centre for camera in cameras])
+    return int(np.linalg.norm(centres - centres.mean(0), axis=1).argmin())
+
+
+def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Trainer:
+    """Spherical harmonics for a lit scene: geometry stays, colours are fitted to the photographs.
+
+    Args:
+        trainer: a finished fit with a light.
+        cameras: in its frame.
+    """
+    light, s = trainer.light, trainer.settings
+    assert light is not None
+    positions = trainer.packed[:, :3].astype(np.float64)
+    normals = light.normals().astype(np.float64)
+    cosine = facing(positions, normals, cameras)
+    albedo = np.clip(light.material[:, :3].astype(np.float64), 0, 1.2)
+    colours = albedo * (1 - s.headlight + s.headlight * cosine)[:, None]
+    sh = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
+    packed = np.concatenate(
+        [trainer.packed[:, :HARMONICS], sh.reshape(len(sh), -1).astype(np.float32)], 1
+    )
+    colours_only = replace(
+        s, iterations=s.light_sh_iterations, coarse_fraction=0.5,
+        feature_rest_lr=s.light_sh_rest_lr, position_lr_init=0.0,
+        position_lr_final=0.0, rotation_lr=0.0, scaling_lr=0.0, opacity_lr=0.0,
+        optimize_poses=False, densify=False, lambda_depth=0.0, lambda_flow=0.0,
+        opacity_reset_interval=0, sh_degree_interval=0,
+    )  # fmt: skip
+    second = Trainer(
+        np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held, trainer.targets,
+        trainer.extent, colours_only,
+    )  # fmt: skip
+    second.exposure.values = trainer.exposure.values
+    second.run(None, lambda *_: None)
+    return second

@@ -1,0 +1,224 @@
+"""What a fit works on: photographs, cameras and points in a frame where the depth is about 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.flow import Flow
+from pipeline.artifacts.points import Points
+from pipeline.artifacts.views import View
+from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
+from stages.fit.lens_light import LensLight, initial_material
+from stages.fit.settings import FitSettings
+from stages.fit.surface import HeldSurface, along_normals
+from stages.fit.targets import Target, make_pyramids, point_depth
+from stages.fit.trainer import Trainer
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+Flows = dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]
+
+#: scene extent: this times the largest distance of a camera from their middle (3DGS), at least
+#: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
+EXTENT_MARGIN = 1.1
+MIN_EXTENT = 0.25
+
+
+#: where fewer of the points than this share are trusted, confidence means something else
+MIN_TRUSTED = 0.02
+#: up to so many views, a surface can be held (`Scene.holds`)
+FEW_VIEWS = 3
+#: surfaces are looked up at this fraction of the image size: measured points are not everywhere
+COARSE_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Attributes:
+    views: the placed ones.
+    cameras: one each, in the frame.
+    cloud: all points, in the frame.
+    trusted: [N] which of them were measured, not filled in.
+    frame: of the fit, in the world.
+    flows: view -> (another view, flow to it, mask).
+    targets: per view, factor -> what the fit compares with.
+    """
+
+    views: tuple[View, ...]
+    cameras: tuple[Camera, ...]
+    cloud: Cloud
+    trusted: Bools
+    frame: Frame
+    flows: Flows
+    targets: list[dict[int, Target]]
+
+    def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
+        """A fit of the scene from its points, with a light beside the lens or with harmonics."""
+        thinned = self.start(settings)
+        packed = initial_gaussians(
+            thinned, self.cameras, opacity=settings.initial_opacity,
+            scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
+            degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
+        )  # fmt: skip
+        light = None
+        if lit:
+            images = [view.image for view in self.views]
+            masks = [view.valid() for view in self.views]
+            light = LensLight(
+                initial_material(
+                    thinned, self.cloud.positions, images, masks, self.cameras, settings
+                ),
+                settings,
+            )
+        held_surface = None
+        if self.holds(settings):
+            along_normals(packed, thinned.normals, settings.hold_flatness)
+            held_surface = HeldSurface(
+                packed,
+                thinned.normals,
+                thinned.weight,
+                settings.hold_strength,
+                settings.hold_growth,
+            )
+        centres = np.array([camera.centre for camera in self.cameras])
+        middle = np.linalg.norm(centres - centres.mean(0), axis=1)
+        extent = max(EXTENT_MARGIN * float(middle.max()), MIN_EXTENT)
+        poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
+        return Trainer(
+            packed, poses, int(middle.argmin()), self.targets, extent, settings, light,
+            held_surface,
+        )  # fmt: skip
+
+    def holds(self, settings: FitSettings) -> bool:
+        """Whether Gaussians are held to the surface of the points.
+
+        Where neighbouring views are too far apart to be matched, the points are a surface that was
+        inferred as a whole, and the photographs can't correct it. Where views do overlap closely,
+        holding costs more than it gives.
+        """
+        if settings.hold_surface != "auto":
+            return bool(settings.hold_surface)
+        if len(self.cameras) > FEW_VIEWS:
+            return False
+        middle = np.median(self.cloud.positions[self.trusted], axis=0)
+        rays = np.array([camera.centre - middle for camera in self.cameras])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        cosines = rays @ rays.T
+        np.fill_diagonal(cosines, -1)
+        closest = np.degrees(np.arccos(np.clip(cosines.max(), -1, 1)))
+        return bool(closest > settings.hold_min_angle)
+
+    def start(self, settings: FitSettings) -> Cloud:
+        """The points that become Gaussians: measured ones first, a limited share filled in."""
+        trusted, fill = self.cloud.select(self.trusted), self.cloud.select(~self.trusted)
+        room = int(settings.initial_points * settings.fill_share)
+        fill = thin(fill, room) if room and len(fill) else fill.select(np.zeros(len(fill), bool))
+        measured = thin(trusted, settings.initial_points - len(fill))
+        measured = smooth_normals(measured, settings.normal_neighbours)
+        return Cloud(
+            *(
+                np.concatenate([getattr(measured, name), getattr(fill, name)])
+                for name in ("positions", "colors", "normals", "weight")
+            )
+        )
+
+    def without(self, view: int) -> Scene:
+        """All views but one (and no flow)."""
+        rest = [index for index in range(len(self.views)) if index != view]
+        return replace(
+            self,
+            views=tuple(self.views[index] for index in rest),
+            cameras=tuple(self.cameras[index] for index in rest),
+            flows={},
+            targets=[self.targets[index] for index in rest],
+        )
+
+
+def prepare(
+    views: Sequence[View],
+    cameras: Sequence[Camera],
+    points: Points,
+    flow: Flow | None,
+    settings: FitSettings,
+) -> Scene:
+    """The scene that a fit works on; arguments as `fitting.fit` has them."""
+    frame = choose_frame(points.positions.astype(np.float64), cameras)
+    local = tuple(in_frame(camera, frame) for camera in cameras)
+    cloud = Cloud(
+        frame.points(points.positions), points.colors.astype(np.float64),
+        points.normals.astype(np.float64), np.maximum(points.confidence, 1).astype(np.float64),
+    )  # fmt: skip
+    trusted = trusted_points(cloud, settings.trusted_confidence)
+    if not trusted.all():
+        keep = trusted | ~out_of_place(
+            cloud.positions, cloud.positions[trusted], local, settings.fill_tolerance
+        )
+        cloud, trusted = cloud.select(keep), trusted[keep]
+    flows = chosen_flows(views, flow) if settings.lambda_flow > 0 else {}
+    factors = {1}
+    if settings.coarse_fraction > 0 or settings.light != "none":
+        factors.add(settings.coarse_factor)
+    if settings.light == "auto":
+        factors.add(settings.light_trial_factor)
+    targets = make_pyramids(
+        [view.image for view in views], [view.valid() for view in views], local, sorted(factors),
+        cloud.positions[trusted] if settings.lambda_depth > 0 else None, flows,
+    )  # fmt: skip
+    return Scene(tuple(views), local, cloud, trusted, frame, flows, targets)
+
+
+def trusted_points(cloud: Cloud, confidence: float) -> Bools:
+    """[N] points that were measured, not filled in; all where that would leave next to none."""
+    trusted = cloud.weight >= confidence
+    return trusted if trusted.mean() > MIN_TRUSTED else np.ones(len(cloud), bool)
+
+
+def out_of_place(
+    positions: Array, surface: Array, cameras: Sequence[Camera], tolerance: float
+) -> Bools:
+    """[N] points filled in where a view knows better, or that no view needs.
+
+    Args:
+        positions: [N, 3]; surface: [M, 3] points that were measured.
+        cameras: in the same frame.
+        tolerance: a point may be so far behind what a view sees at its pixel, relative to the
+            depth, and still count as an attempt at the same surface.
+    """
+    wrong, needed = np.zeros((2, len(positions)), bool)
+    for camera in cameras:
+        width, height = camera.width // COARSE_DEPTH, camera.height // COARSE_DEPTH
+        front = point_depth(surface, camera, width, height)
+        pixels, depth = camera.resized(width, height).project(positions)
+        column, row = np.floor(pixels[:, 0]).astype(int), np.floor(pixels[:, 1]).astype(int)
+        seen = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        limit = np.zeros(len(positions))
+        limit[seen] = front[row[seen], column[seen]]
+        wrong |= seen & (depth < limit * (1 + tolerance))
+        needed |= seen & (limit == 0)
+    return wrong | ~needed
+
+
+def in_frame(camera: Camera, frame: Frame) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3] = frame.pose(camera.cam_from_world)
+    return replace(camera, cam_from_world=matrix)
+
+
+def chosen_flows(
+    views: Sequence[View], flow: Flow | None
+) -> dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]:
+    """For each placed view its flow to another placed one: (index of that, flow, mask)."""
+    index = {view.name: position for position, view in enumerate(views)}
+    chosen: dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]] = {}
+    for pair in flow.pairs if flow is not None else ():
+        i, j = index.get(pair.name_i), index.get(pair.name_j)
+        if i is None or j is None or i in chosen or not pair.mask_forward.any():
+            continue
+        chosen[i] = (j, pair.forward, pair.mask_forward)
+    return chosen

@@ -1,0 +1,84 @@
+"""Gaussians held to the surface that they start on, in proportion to how sure it is.
+
+From three photographs a fit can explain every pixel with needles and gaps that only the three
+cameras don't see. Where the surface is known, only colour is left to be found: Gaussians start as
+flat discs along it, and what takes them off it is drawn back after every step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.fit.checkpoint import Arrays
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+
+
+def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
+    """Turn Gaussians so that their third axis is the normal, and flatten them along it.
+
+    Args:
+        packed: [N, D], changed in place.
+        normals: [N, 3] unit, 0 where unknown (those stay as they are).
+        flatness: standard deviation along the normal, relative to that across it.
+    """
+    known = np.abs(normals).sum(1) > 0
+    n = normals[known]
+    # the shortest turn from z to n; for n = -z any half turn will do
+    quaternion = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], 1)
+    quaternion[1 + n[:, 2] < 1e-6] = (0, 1, 0, 0)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    packed[known, 3:7] = quaternion
+    packed[known, 9] += np.float32(np.log(flatness))
+
+
+class HeldSurface:
+    """Where each Gaussian belongs, and how firmly.
+
+    Attributes:
+        anchor: [N, 9] float32: position, normal (0: free), log of the thickness, firmness 0..1, log
+            of the largest width.
+        turn: [N, 4] float32 quaternion to be kept.
+    """
+
+    def __init__(
+        self, packed: Floats, normals: Array, confidence: Array, strength: float, growth: float
+    ) -> None:
+        """
+        Args:
+            packed: [N, D] Gaussians as they start.
+            normals: [N, 3] unit, or 0.
+            confidence: [N], raw, >= 1; the median of those above 1.5 is sure.
+            strength: share of the way back that a sure Gaussian goes after each step, 0..1.
+            growth: by which factor Gaussians may get wider than they start.
+        """
+        measured = confidence[confidence > 1.5]
+        sure = float(np.median(measured)) if len(measured) else 2.0
+        firmness = np.clip((confidence - 1) / (sure - 1), 0, 1) * strength
+        firmness = firmness * (np.abs(normals).sum(1) > 0)
+        widest = packed[:, 7:9].max(1, keepdims=True) + np.log(growth)
+        columns = [packed[:, :3], normals, packed[:, 9:10], firmness[:, None], widest]
+        self.anchor: Floats = np.concatenate(columns, 1).astype(np.float32)
+        self.turn: Floats = packed[:, 3:7].copy()
+
+    def pull(self, packed: Floats) -> None:
+        """Draw Gaussians back onto their surface: position, turn, thickness; bound the width."""
+        normal, firmness = self.anchor[:, 3:6], self.anchor[:, 7]
+        off = ((packed[:, :3] - self.anchor[:, :3]) * normal).sum(1) * firmness
+        packed[:, :3] -= off[:, None] * normal
+        packed[:, 3:7] += firmness[:, None] * (self.turn - packed[:, 3:7])
+        packed[:, 9] += firmness * (self.anchor[:, 6] - packed[:, 9])
+        np.minimum(packed[:, 7:10], self.anchor[:, 8:9], out=packed[:, 7:10])
+
+    def select(self, source: npt.NDArray[np.int64]) -> None:
+        """Rows follow those of the packed scene."""
+        self.anchor = np.ascontiguousarray(self.anchor[source])
+        self.turn = np.ascontiguousarray(self.turn[source])
+
+    def arrays(self) -> Arrays:
+        return {"held_anchor": self.anchor, "held_turn": self.turn}
+
+    def restore(self, arrays: Arrays) -> None:
+        self.anchor, self.turn = arrays["held_anchor"], arrays["held_turn"]

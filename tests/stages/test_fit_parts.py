@@ -1,0 +1,186 @@
+"""Parts of the fit: sampling densification, held surfaces, filled points, the shared focal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.cameras import Camera
+from stages.fit.config import FitConfig
+from stages.fit.density import rotations
+from stages.fit.initial import Cloud, Frame, smooth_normals, thin
+from stages.fit.mcmc import add_noise, add_regularisers, relocate, shared
+from stages.fit.poses import SharedFocal
+from stages.fit.scene import Scene, out_of_place, trusted_points
+from stages.fit.settings import resolve
+from stages.fit.surface import HeldSurface, along_normals
+
+
+def packed_scene(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    packed = np.zeros((count, 14), np.float32)
+    packed[:, :3] = rng.normal(size=(count, 3))
+    packed[:, 3:7] = rng.normal(size=(count, 4))
+    packed[:, 7:10] = np.log(rng.uniform(0.01, 0.1, (count, 3)))
+    packed[:, 10] = rng.normal(size=count)
+    return packed
+
+
+def test_shared_gaussians_stop_as_much_light_as_the_one_did() -> None:
+    opacity = np.array([0.9, 0.5, 0.05, 0.7])
+    sharers = np.array([2, 5, 3, 1])
+    share, factor = shared(opacity, sharers)
+    assert 1 - (1 - share.astype(float)) ** sharers == pytest.approx(opacity, abs=1e-5)
+    assert factor[3] == pytest.approx(1)
+    # two of opacity a at scale f integrate to 2 a f - a^2 f / sqrt(2), as one of opacity 0.9 does
+    a = float(share[0])
+    assert float(factor[0]) * (2 * a - a**2 / np.sqrt(2)) == pytest.approx(0.9, abs=1e-5)
+
+
+def test_relocation_moves_the_dead_and_keeps_to_the_cap() -> None:
+    packed = packed_scene(400)
+    packed[:40, 10] = -9  # dead
+    random = np.random.default_rng(1)
+    moved, source, fresh = relocate(packed, 0.005, 410, random)
+    assert len(moved) == 410 == len(source) == len(fresh)
+    assert not np.isin(source, np.arange(40)).any()
+    assert (1 / (1 + np.exp(-moved[:, 10])) >= 0.0049).all()
+    same = ~fresh
+    assert np.array_equal(moved[same], packed[source[same]])
+    counts = np.bincount(source, minlength=400)
+    assert (counts[source[fresh]] > 1).all() and fresh.sum() > 50
+    again = relocate(packed, 0.005, 410, np.random.default_rng(1))
+    assert np.array_equal(again[0], moved)
+
+
+def test_noise_moves_the_transparent_only() -> None:
+    packed = packed_scene(200)
+    packed[:100, 10] = 4
+    packed[100:, 10] = -9
+    before = packed.copy()
+    add_noise(packed, 10.0, np.random.default_rng(0))
+    step = np.abs(packed - before).max(1)
+    assert step[:100].max() < 1e-6 < step[100:].min()
+    assert np.array_equal(packed[:, 3:], before[:, 3:])
+
+
+def test_regularisers_against_finite_differences() -> None:
+    packed = packed_scene(50).astype(np.float64)
+    gradient = np.zeros_like(packed)
+    add_regularisers(packed, gradient, 0.3, 0.7)
+
+    def value(p: np.ndarray) -> float:
+        return 0.3 * (1 / (1 + np.exp(-p[:, 10]))).mean() + 0.7 * np.exp(p[:, 7:10]).mean()
+
+    for column in (7, 9, 10):
+        up, down = packed.copy(), packed.copy()
+        up[5, column] += 1e-5
+        down[5, column] -= 1e-5
+        assert gradient[5, column] == pytest.approx((value(up) - value(down)) / 2e-5, rel=1e-4)
+
+
+def test_gaussians_lie_along_their_normals_and_are_held_there() -> None:
+    rng = np.random.default_rng(2)
+    packed = packed_scene(300)
+    packed[:, 3:7] = (1, 0, 0, 0)
+    packed[:, 7:10] = np.log(0.05)
+    normals = rng.normal(size=(300, 3))
+    normals[:3] = [[0, 0, 1], [0, 0, -1], [0, 0, 0]]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.where(length > 0, length, 1)
+    along_normals(packed, normals, 0.25)
+    known = np.abs(normals).sum(1) > 0
+    axes = rotations(packed[:, 3:7])[:, :, 2]
+    assert np.allclose(axes[known], normals[known], atol=1e-5)
+    assert np.allclose(np.exp(packed[known, 9]), 0.0125) and packed[2, 9] == packed[2, 7]
+    confidence = np.full(300, 10.0)
+    confidence[150:] = 1.0
+    held = HeldSurface(packed, normals, confidence, 0.5, 3.0)
+    start = packed.copy()
+    packed[:, :3] += rng.normal(size=(300, 3)).astype(np.float32)
+    packed[7, 7:10] = np.log(0.5)
+    moved = packed.copy()
+    held.pull(packed)
+    assert np.allclose(packed[7, 7:9], np.log(0.15))  # no needle
+    off = ((moved - start)[:, :3] * normals).sum(1)
+    left = ((packed - start)[:, :3] * normals).sum(1)
+    firm = known & (np.arange(300) < 150)
+    assert np.allclose(left[firm], 0.5 * off[firm], atol=1e-5)
+    across = packed[:, :3] - moved[:, :3] + (off - left)[:, None] * normals
+    assert np.abs(across).max() < 1e-5  # along the surface they are free
+    assert np.array_equal(packed[150:], moved[150:])  # and where nothing is sure
+    assert np.array_equal(packed[2], moved[2])  # and without a normal
+
+
+def test_normals_are_averaged_on_one_side_of_a_sheet_only() -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(-1, 1, (400, 2))
+    front = np.concatenate([xy, np.zeros((400, 1))], 1)
+    back = front + np.array([0, 0, 0.01])
+    noisy = np.array([0, 0, -1]) + 0.3 * rng.normal(size=(400, 3))
+    normals = np.concatenate([noisy, [[0, 0, 1]] * 400])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = Cloud(np.concatenate([front, back]), np.zeros((800, 3)), normals, np.ones(800))
+    smooth = smooth_normals(cloud, 16).normals
+    assert np.allclose(np.linalg.norm(smooth, axis=1), 1)
+    assert smooth[:400, 2].mean() < -0.97 > normals[:400, 2].mean() - 0.1
+    assert (smooth[400:, 2] > 0.99).all()
+
+
+def test_thinning_keeps_confidence_a_confidence() -> None:
+    rng = np.random.default_rng(4)
+    cloud = Cloud(
+        rng.uniform(size=(5000, 3)), rng.uniform(size=(5000, 3)),
+        np.tile([0.0, 0, 1], (5000, 1)), rng.uniform(1, 7, 5000),
+    )  # fmt: skip
+    thinned = thin(cloud, 300)
+    assert 200 < len(thinned) < 400
+    assert thinned.weight.min() >= 1 and thinned.weight.max() <= 7
+
+
+def test_filled_points_that_a_view_contradicts_are_left_out() -> None:
+    camera = Camera("000", 160, 120, 160.0, 160.0, 80.0, 60.0, np.eye(4))
+    y, x = np.mgrid[-0.3:0.3:120j, -0.45:0.0:120j]
+    wall = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)  # the left half
+    filled = np.array(
+        [[-0.1, 0, 0.5], [-0.2, 0, 1.01], [-0.3, 0, 1.5], [0.2, 0, 0.6], [9, 9, 1]], float
+    )
+    # before it, on it, behind it, beside it, and in no view
+    wrong = out_of_place(filled, wall, [camera], 0.03)
+    assert wrong.tolist() == [True, True, True, False, True]
+    cloud = Cloud(filled, filled, filled, np.array([1, 1.2, 5, 6, 1.1]))
+    assert trusted_points(cloud, 1.5).tolist() == [False, False, True, True, False]
+    assert trusted_points(cloud, 100).all()  # confidence of another kind
+
+
+def test_the_shared_focal_walks_to_where_its_gradient_ends() -> None:
+    focal = SharedFocal()
+    intrinsics = np.array([100, 120, 50, 40], np.float32)
+    for _ in range(400):
+        used = focal.apply(intrinsics)
+        focal.step(np.array([used[0] - 104.0, 0.0]), used, 1e-3)
+    assert focal.apply(intrinsics)[0] == pytest.approx(104, abs=0.2)
+    assert focal.apply(intrinsics)[1] == pytest.approx(124.8, abs=0.3)
+    assert focal.apply(intrinsics)[2:].tolist() == [50, 40]
+    other = SharedFocal()
+    other.restore(focal.state())
+    assert other.state() == focal.state()
+
+
+def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
+    def scene(angles: list[float]) -> Scene:
+        cameras = []
+        for angle in np.radians(angles):
+            c, s = np.cos(angle), np.sin(angle)
+            pose = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, 1], [0, 0, 0, 1]], float)
+            cameras.append(Camera(str(angle), 64, 48, 70.0, 70.0, 32.0, 24.0, pose))
+        cloud = Cloud(*(np.zeros((5, 3)),) * 3, np.ones(5))
+        frame = Frame(np.zeros(3), 1.0)
+        return Scene((), tuple(cameras), cloud, np.ones(5, bool), frame, {}, [])
+
+    settings = resolve(FitConfig().model_dump(), 3, 0)
+    assert scene([-45, 0, 45]).holds(settings)
+    assert not scene([-45, 0, 20]).holds(settings)
+    assert not scene([-60, -25, 10, 45]).holds(settings)
+    off = resolve(FitConfig(hold_surface=False).model_dump(), 3, 0)
+    assert not scene([-45, 0, 45]).holds(off)
