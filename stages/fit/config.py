@@ -25,6 +25,12 @@ class FitConfig(StageConfig):
     initial_points: Auto | int = number(
         AUTO, "thin the input points to about this many (auto: 15000, 30000 from 6 views)"
     )
+    held_points: int = number(
+        60_000,
+        "the same where Gaussians are held to their surface (hold_surface): geometry can't overfit "
+        "then, and more points carry more detail",
+        ge=1,
+    )
     trusted_confidence: float = number(
         1.5,
         "input points of less (raw) confidence were filled in: they are no depth prior, and are "

@@ -117,9 +117,11 @@ class Scene:
     def start(self, settings: FitSettings) -> Cloud:
         """The points that become Gaussians: measured ones first, a limited share filled in."""
         trusted, fill = self.cloud.select(self.trusted), self.cloud.select(~self.trusted)
-        room = int(settings.initial_points * settings.fill_share)
+        held = self.holds(settings)
+        count = settings.held_points if held else settings.initial_points
+        room = int(count * settings.fill_share)
         fill = thin(fill, room) if room and len(fill) else fill.select(np.zeros(len(fill), bool))
-        measured = thin(trusted, settings.initial_points - len(fill))
+        measured = thin(trusted, count - len(fill))
         measured = smooth_normals(measured, settings.normal_neighbours)
         return Cloud(
             *(

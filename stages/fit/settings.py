@@ -19,6 +19,7 @@ class FitSettings:
 
     iterations: int
     initial_points: int
+    held_points: int
     trusted_confidence: float
     fill_tolerance: float
     fill_share: float

@@ -37,7 +37,7 @@ class SapConfig(StageConfig):
         "but those that target_points needs.",
     )  # fmt: skip
     target_points: int = Field(
-        20_000, ge=0, le=100_000_000,
+        100_000, ge=0, le=100_000_000,
         description="At most so many points are left: the voxels grow until they are. 0: no limit.",
     )  # fmt: skip
     fill_confidence: float = Field(
@@ -53,7 +53,7 @@ class SapStage(Stage):
     """Reduce the dense cloud to what a splat fit can use."""
 
     name = "sap"
-    version = 1
+    version = 2
     summary = "voxel downsampling, then scale-adaptive pruning of outliers"
     Config = SapConfig
     requires = ("points",)
