@@ -9,7 +9,7 @@ import numpy as np
 from stages.init.colmap import quiet_pycolmap
 from stages.init.mapping import Distortions, MappingInput, Solution, lens_cameras, solution_of
 from stages.init.options import RefinementOptions
-from stages.init.solver import Solver
+from stages.init.solver import EXIF_TOLERANCE, Solver
 from stages.init.undistort import distort_pixels
 
 #: A lens that shrinks its corners, relative to its middle, to less than this share is a wrong guess
@@ -82,13 +82,22 @@ def _lenses_seen_enough(
 
 
 def _believable(solver: Solver, solution: Solution) -> bool:
-    """Focal lengths and error as a camera's, and no lens that folds its image."""
-    lenses = zip(
-        solver.given.lenses,
-        solver.focals_of(solution),
-        solver.distortions_of(solution),
-        strict=True,
+    """Focal lengths and error as a camera's, near EXIF's, and no lens that folds its image.
+
+    From three photographs a radial coefficient and the focal length can trade places; EXIF decides.
+    """
+    lenses = list(
+        zip(
+            solver.given.lenses,
+            solver.focals_of(solution),
+            solver.distortions_of(solution),
+            strict=True,
+        )
     )
+    if any(
+        lens.focal and abs(focal / lens.focal - 1) > EXIF_TOLERANCE for lens, focal, _ in lenses
+    ):
+        return False
     corners = [
         1 + 3 * k1 * (lens.width**2 + lens.height**2) / (4 * focal**2) for lens, focal, k1 in lenses
     ]
