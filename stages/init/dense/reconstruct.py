@@ -15,6 +15,7 @@ from stages.init.dense.appearance import highlights, normals_from_depth, to_gray
 from stages.init.dense.consistency import camera_table, check, stack_depths
 from stages.init.dense.fill import complete, distance_to
 from stages.init.dense.options import METHODS, DenseOptions, DenseView
+from stages.init.dense.polish import polish, source_maps
 from stages.init.dense.sgbm import ASSUMED_CORRELATION, sgbm_depth
 from stages.init.dense.sources import (
     inverse_depth_range,
@@ -147,9 +148,16 @@ def _sweep_view(
     total = aggregate(volume, penalty, options.p1)
     plane, ncc, _ = decide(total, volume)
     # The first and the last plane stand for all that lies beyond the range.
-    ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc)
+    ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc).astype(np.float32)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)
-    return depth.astype(np.float32), ncc.astype(np.float32)
+    if not options.polish:
+        return depth.astype(np.float32), ncc
+    kept = np.where(ncc > options.min_ncc, depth, 0).astype(np.float32)
+    step = (ends[1] - ends[0]) / (planes - 1) / max(float(np.mean(ends)), 1e-12)
+    return polish(
+        grays[index], usable[index], stack, sizes, source_maps(camera, lenses), kept, ncc,
+        options.polish, options.polish_window, float(step), index,
+    )  # fmt: skip
 
 
 def _sgbm_view(
