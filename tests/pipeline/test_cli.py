@@ -126,7 +126,10 @@ def test_really_full_disk(toys: Path) -> None:
 
 def test_interrupt_is_resumable(toys: Path) -> None:
     slow = (*RUN, "--set", "count.step_seconds=0.05")
+    # Started in the background, a test run ignores interrupts, and so would its children.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command(toys, *slow), cwd=toys, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     wait_for_checkpoint(toys / "w")
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=30) == 130
