@@ -235,22 +235,3 @@ def _pair_scale(pair: PointmapPair, camera_i: Camera, camera_j: Camera) -> float
     scale = float(np.median(estimate[usable]))
     # Pointmaps made with these cameras have exactly their scale, up to rounding.
     return 1.0 if abs(scale - 1) < 2e-3 else scale
-
-
-def misfit(pairs: Sequence[PointmapPair], start: Start) -> float:
-    """How far pointmaps are from cameras: median angle, radians, between a view's rays and points.
-
-    Pointmaps that were made with these cameras lie on the rays up to rounding.
-    """
-    angles = []
-    for pair, motion in zip(sampled(pairs, SAMPLES), start.pair_from, strict=True):
-        if motion is None:
-            continue
-        for side in pair.sides:
-            camera = start.cameras[side.name]
-            known = side.weight > 0
-            local = _move(motion, side.points[known]) @ camera.rotation.T + camera.translation
-            ray = _rays(camera, SAMPLES)[known]
-            sine = np.linalg.norm(np.cross(ray, local), axis=1)
-            angles.append(np.arctan2(sine, (ray * local).sum(1)))
-    return float(np.median(np.concatenate(angles))) if angles else 0.0

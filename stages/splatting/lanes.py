@@ -152,16 +152,6 @@ def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def spread_int(typing_context, value):  # type: ignore[no-untyped-def]
-    """An integer in every lane."""
-
-    def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
-        return as_int_lanes(context, builder, arguments[0], sig.args[0])
-
-    return int_lanes(value), generate
-
-
-@intrinsic
 def count_up(typing_context):  # type: ignore[no-untyped-def]
     """0, 1, ... 15."""
 

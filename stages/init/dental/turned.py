@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -18,13 +16,6 @@ _BACKGROUND = 0.94
 _DISTANCE = 160.0
 #: Rendered so many times larger, then averaged.
 _OVERSAMPLING = 2
-
-
-@dataclass(frozen=True)
-class _Pose:
-    rotation: Array64
-    translation: Array64
-    focal: float
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
