@@ -19,13 +19,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
+from pipeline.config import load_config, presets
 from stages.fit import trainer
-from stages.fit.config import FitConfig
 from stages.fit.density import DensityStatistics
 from stages.fit.fitting import fit
 from stages.fit.settings import FitSettings, resolve
@@ -112,13 +111,11 @@ def sample() -> tuple[list[View], list[Camera], Points]:
 
 
 def settings_of(preset: str, iterations: int | None, views: int) -> FitSettings | None:
-    path = ROOT / "configs" / f"{preset}.yaml"
-    if not path.exists():
+    if preset not in presets():
         return None
-    fields = (yaml.safe_load(path.read_text()) or {}).get("fit") or {}
-    if iterations is not None:
-        fields["iterations"] = iterations
-    return resolve(FitConfig(**fields).model_dump(), views, seed=0)
+    overrides = {} if iterations is None else {"fit.iterations": iterations}
+    config = load_config(preset, overrides).sections["fit"]
+    return resolve(config.model_dump(), views, seed=0)
 
 
 def main() -> None:

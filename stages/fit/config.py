@@ -20,22 +20,18 @@ class FitConfig(StageConfig):
     """``auto`` follows the number of placed views; the summary tells what it came to."""
 
     iterations: Auto | int = number(
-        AUTO, "optimiser steps, one view each (auto: 400 at 3 views, 1000 from 6)"
+        AUTO,
+        "optimiser steps, one view each (auto: 400 at 3 views, 1000 from 6; 600 on a held surface)",
     )
     initial_points: Auto | int = number(
-        AUTO, "thin the input points to about this many (auto: 15000, 30000 from 6 views)"
+        AUTO,
+        "thin the input points to about this many (auto: 15000, 30000 from 6 views; 60000 on a "
+        "held surface, where geometry can't overfit and more points carry more detail)",
     )
-    held_points: int = number(
-        60_000,
-        "the same where Gaussians are held to their surface (hold_surface): geometry can't overfit "
-        "then, and more points carry more detail",
-        ge=1,
-    )
-    trusted_confidence: float = number(
-        1.5,
+    trusted_confidence: Auto | float = number(
+        AUTO,
         "input points of less (raw) confidence were filled in: they are no depth prior, and are "
-        "left out where they stand before others",
-        ge=1,
+        "left out where they stand before others (auto: 1.5; all are trusted on a held surface)",
     )
     fill_tolerance: float = number(
         0.03,
@@ -67,7 +63,9 @@ class FitConfig(StageConfig):
     initial_scale_max_px: float = number(
         6.0, "and its largest value, in pixels of the nearest view", gt=0
     )
-    sh_degree: int = number(1, "degree of the spherical harmonics", ge=0, le=3)
+    sh_degree: Auto | int = number(
+        AUTO, "degree of the spherical harmonics (auto: 1; 2 on a held surface)"
+    )
     sh_degree_interval: int = number(
         0, "iterations until the next degree is used; 0: all from the start (3DGS: 1000)", ge=0
     )
@@ -151,6 +149,21 @@ class FitConfig(StageConfig):
     )
     pose_lr_final: Auto | float = number(AUTO, "learning rate of pose increments at the end")
     pose_from_iter: int = number(0, "first iteration that refines poses", ge=0)
+    progressive: bool = number(
+        False,
+        "bring in the views one after another in viewing order, each placed by the Gaussians of "
+        "those before it (CF-3DGS); of the poses found before, only the first one's is used",
+    )
+    progressive_iterations: int = number(
+        100, "progressive: iterations per view until the next one is placed", ge=1
+    )
+    progressive_pose_iterations: int = number(
+        300, "progressive: steps that place a view, with the Gaussians frozen", ge=1
+    )
+    progressive_pose_lr_init: float = number(
+        3e-3, "progressive: learning rate of the pose at the first of these steps", gt=0
+    )
+    progressive_pose_lr_final: float = number(3e-5, "progressive: and at the last one", gt=0)
     optimize_focal: bool = number(
         False, "refine the focal length as well, by one factor that all views share"
     )
@@ -169,7 +182,7 @@ class FitConfig(StageConfig):
         30.0, "hold_surface auto: neighbouring views further apart than this, degrees", ge=0, le=180
     )
     hold_strength: float = number(
-        0.3, "share of the way back that a sure Gaussian goes after each step", ge=0, le=1
+        0.15, "share of the way back that a sure Gaussian goes after each step", ge=0, le=1
     )
     hold_flatness: float = number(
         0.6, "thickness of held Gaussians, relative to their width", gt=0, le=1
@@ -221,11 +234,10 @@ class FitConfig(StageConfig):
         ge=0,
         lt=1,
     )
-    final_prune_masked: float = number(
-        0.2,
-        "finally remove Gaussians with less than this share of their area inside the masks",
-        ge=0,
-        le=1,
+    final_prune_masked: Auto | float = number(
+        AUTO,
+        "finally remove Gaussians with less than this share of their area inside the masks: they "
+        "have grown out of them (auto: 0.2; 0 on a held surface, which has a rim and no needles)",
     )
     near: float = number(0.05, "near plane, as a share of the scene's median depth", gt=0)
     background: tuple[float, float, float] = number(
@@ -245,9 +257,21 @@ class FitConfig(StageConfig):
             "iterations": 1, "initial_points": 4, "lambda_depth": 0, "feature_lr": 0,
             "feature_rest_lr": 0, "light_albedo_lr": 0, "scaling_lr": 0, "rotation_lr": 0,
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
+            "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
         }  # fmt: skip
+        if self.progressive:
+            plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0
+            if not plain or self.strategy != "default":
+                raise ValueError(
+                    "progressive works with light none, hold_surface false, lambda_flow 0 and "
+                    "strategy default only"
+                )
         for name, least in limits.items():
             value = getattr(self, name)
             if value != "auto" and value < least:
                 raise ValueError(f"{name} must be 'auto' or at least {least}, not {value}")
+        for name, most in {"sh_degree": 3, "final_prune_masked": 1}.items():
+            value = getattr(self, name)
+            if value != "auto" and value > most:
+                raise ValueError(f"{name} must be 'auto' or at most {most}, not {value}")
         return self

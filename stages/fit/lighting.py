@@ -30,7 +30,7 @@ def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, fl
     factor = settings.light_trial_factor
     trial = replace(
         settings, iterations=settings.light_trial_iterations,
-        initial_points=settings.light_trial_points, held_points=settings.light_trial_points,
+        initial_points=settings.light_trial_points,
         coarse_fraction=1.0, coarse_factor=factor,
         lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False,
         opacity_reset_interval=0, sh_degree_interval=0,

@@ -5,25 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from stages.geometry.rigid import moved_by
+
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
-
-
-def skew(vector: Array) -> Array:
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def exponential(twist: Array) -> tuple[Array, Array]:
-    """Rotation [3, 3] and translation [3] of exp(twist), twist = (translation 3, rotation 3)."""
-    angle = float(np.linalg.norm(twist[3:]))
-    cross = skew(twist[3:])
-    if angle < 1e-8:
-        return np.eye(3) + cross, twist[:3] + 0.5 * cross @ twist[:3]
-    a, b = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2
-    c = (1 - a) / angle**2
-    rotation = np.eye(3) + a * cross + b * cross @ cross
-    return rotation, (np.eye(3) + b * cross + c * cross @ cross) @ twist[:3]
 
 
 class PoseOptimizer:
@@ -43,24 +28,28 @@ class PoseOptimizer:
         self.steps = np.zeros(len(poses), np.int64)
         self.held = held
 
-    def step(self, view: int, gradient: Array, rate: float) -> None:
-        """Move one view's pose against the gradient [6] of its twist."""
+    def step(self, view: int, gradient: Array, rate: float, pivot: Array | None = None) -> None:
+        """Move one view's pose against the gradient [6] of its twist.
+
+        Args:
+            pivot: [3] in the camera, what the camera turns about; None: itself. A camera that
+                turns about what it looks at hardly moves the image, so that a long way round
+                a scene is a few easy steps and not a narrow valley between turning and shifting.
+        """
         if view == self.held:
             return
+        if pivot is not None:
+            gradient = gradient + np.concatenate([np.zeros(3), np.cross(gradient[:3], pivot)])
         self.steps[view] += 1
         step = int(self.steps[view])
         self.first[view] = 0.9 * self.first[view] + 0.1 * gradient
         self.second[view] = 0.999 * self.second[view] + 0.001 * gradient**2
         mean = self.first[view] / (1 - 0.9**step)
         spread = np.sqrt(self.second[view] / (1 - 0.999**step))
-        rotation, translation = exponential(-rate * mean / (spread + 1e-15))
-        pose = self.poses[view]
-        moved = np.concatenate([rotation @ pose[:, :3], (rotation @ pose[:, 3:])], 1)
-        moved[:, 3] += translation
-        # rounding must not turn a rotation into something else over thousands of steps
-        u, _, vt = np.linalg.svd(moved[:, :3])
-        moved[:, :3] = u @ vt
-        self.poses[view] = moved
+        twist = -rate * mean / (spread + 1e-15)
+        if pivot is not None:
+            twist[:3] += np.cross(pivot, twist[3:])
+        self.poses[view] = moved_by(twist, self.poses[view])
 
 
 class SharedFocal:

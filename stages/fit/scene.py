@@ -14,6 +14,7 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
 from stages.fit.lens_light import LensLight, initial_material
+from stages.fit.progressive import Progressive
 from stages.fit.settings import FitSettings
 from stages.fit.surface import HeldSurface, along_normals
 from stages.fit.targets import Target, make_pyramids, point_depth
@@ -32,8 +33,6 @@ MIN_EXTENT = 0.25
 
 #: where fewer of the points than this share are trusted, confidence means something else
 MIN_TRUSTED = 0.02
-#: up to so many views, a surface can be held (`Scene.holds`)
-FEW_VIEWS = 3
 #: surfaces are looked up at this fraction of the image size: measured points are not everywhere
 COARSE_DEPTH = 4
 
@@ -60,6 +59,8 @@ class Scene:
 
     def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
         """A fit of the scene from its points, with a light beside the lens or with harmonics."""
+        if settings.progressive:
+            return self._one_after_another(settings)
         thinned = self.start(settings)
         packed = initial_gaussians(
             thinned, self.cameras, opacity=settings.initial_opacity,
@@ -77,7 +78,7 @@ class Scene:
                 settings,
             )
         held_surface = None
-        if self.holds(settings):
+        if settings.hold_surface:
             along_normals(packed, thinned.normals, settings.hold_flatness)
             held_surface = HeldSurface(
                 packed,
@@ -86,39 +87,32 @@ class Scene:
                 settings.hold_strength,
                 settings.hold_growth,
             )
-        centres = np.array([camera.centre for camera in self.cameras])
-        middle = np.linalg.norm(centres - centres.mean(0), axis=1)
-        extent = max(EXTENT_MARGIN * float(middle.max()), MIN_EXTENT)
+        extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
         return Trainer(
-            packed, poses, int(middle.argmin()), self.targets, extent, settings, light,
-            held_surface,
+            packed, poses, middle, self.targets, extent, settings, light, held_surface
         )  # fmt: skip
 
-    def holds(self, settings: FitSettings) -> bool:
-        """Whether Gaussians are held to the surface of the points.
+    def _one_after_another(self, settings: FitSettings) -> Trainer:
+        """A fit that begins with one view and places the others itself."""
+        progressive = Progressive(self.views, self.cameras, self.cloud.positions, settings)
+        first = progressive.order[0]
+        poses = np.repeat(self.cameras[first].cam_from_world[None, :3], len(self.cameras), 0)
+        return Trainer(
+            progressive.first_gaussians(), poses, first, self.targets, self.extent()[0], settings,
+            progressive=progressive,
+        )  # fmt: skip
 
-        Where neighbouring views are too far apart to be matched, the points are a surface that was
-        inferred as a whole, and the photographs can't correct it. Where views do overlap closely,
-        holding costs more than it gives.
-        """
-        if settings.hold_surface != "auto":
-            return bool(settings.hold_surface)
-        if len(self.cameras) > FEW_VIEWS:
-            return False
-        middle = np.median(self.cloud.positions[self.trusted], axis=0)
-        rays = np.array([camera.centre - middle for camera in self.cameras])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cosines = rays @ rays.T
-        np.fill_diagonal(cosines, -1)
-        closest = np.degrees(np.arccos(np.clip(cosines.max(), -1, 1)))
-        return bool(closest > settings.hold_min_angle)
+    def extent(self) -> tuple[float, int]:
+        """Size of the scene that the position rate is relative to, and the view in the middle."""
+        centres = np.array([camera.centre for camera in self.cameras])
+        distance = np.linalg.norm(centres - centres.mean(0), axis=1)
+        return max(EXTENT_MARGIN * float(distance.max()), MIN_EXTENT), int(distance.argmin())
 
     def start(self, settings: FitSettings) -> Cloud:
         """The points that become Gaussians: measured ones first, a limited share filled in."""
         trusted, fill = self.cloud.select(self.trusted), self.cloud.select(~self.trusted)
-        held = self.holds(settings)
-        count = settings.held_points if held else settings.initial_points
+        count = settings.initial_points
         room = int(count * settings.fill_share)
         fill = thin(fill, room) if room and len(fill) else fill.select(np.zeros(len(fill), bool))
         measured = thin(trusted, count - len(fill))

@@ -13,13 +13,11 @@ MANY_VIEWS = 6
 class FitSettings:
     """See `config.FitConfig` for what each field means.
 
-    What depends on the number of views is not ``"auto"`` any more; `light` and `hold_surface` may
-    be: they depend on the scene.
+    What depends on the views is not ``"auto"`` any more; `light` may be: a trial decides.
     """
 
     iterations: int
     initial_points: int
-    held_points: int
     trusted_confidence: float
     fill_tolerance: float
     fill_share: float
@@ -65,12 +63,17 @@ class FitSettings:
     pose_lr_init: float
     pose_lr_final: float
     pose_from_iter: int
+    progressive: bool
+    progressive_iterations: int
+    progressive_pose_iterations: int
+    progressive_pose_lr_init: float
+    progressive_pose_lr_final: float
     optimize_focal: bool
     focal_lr: float
     exposure: bool
     exposure_lr: float
     isotropic: bool
-    hold_surface: bool | str
+    hold_surface: bool
     hold_min_angle: float
     hold_strength: float
     hold_flatness: float
@@ -102,18 +105,27 @@ class FitSettings:
     checkpoint_every: int
 
 
-def automatic(views: int) -> dict[str, Any]:
-    """The values that ``"auto"`` stands for, from the number of placed views.
+def automatic(views: int, held: bool = False) -> dict[str, Any]:
+    """The values that ``"auto"`` stands for.
 
     Few views overfit: few Gaussians, few iterations, no densification. From six views on a fit of
-    1,000 iterations is short of steps: higher rates and densification (both measured).
+    1,000 iterations is short of steps: higher rates and densification. On a held surface only
+    colours can overfit: many Gaussians, and colours that follow the photographs (all measured).
+
+    Args:
+        views: how many are placed.
+        held: Gaussians are held to their surface.
     """
     many = views >= MANY_VIEWS
     rate = 6.0 if many else 2.0
     iterations = 1000 if many else 400 + 200 * max(0, views - 3)
-    return {
+    chosen = {
+        "hold_surface": held,
         "iterations": iterations,
         "initial_points": 30000 if many else 15000,
+        "trusted_confidence": 1.5,
+        "sh_degree": 1,
+        "final_prune_masked": 0.2,
         "feature_lr": 2.5e-3 * rate,
         "feature_rest_lr": 2.5e-3 / 20 * rate,
         # in colour, not in harmonics: C0 times as much
@@ -126,12 +138,32 @@ def automatic(views: int) -> dict[str, Any]:
         "pose_lr_init": 3e-4,
         "pose_lr_final": 3e-6,
     }
+    if held:
+        chosen |= {
+            "iterations": 600,
+            "initial_points": 60000,
+            "trusted_confidence": 1.0,
+            "sh_degree": 2,
+            "final_prune_masked": 0.0,
+            "feature_lr": 1.5e-2,
+            "feature_rest_lr": 2e-3,
+        }
+    return chosen
 
 
-def resolve(values: dict[str, Any], views: int, seed: int) -> FitSettings:
-    """Replace every ``"auto"`` of a config's values by what it stands for with so many views."""
+def resolve(values: dict[str, Any], views: int, seed: int, held: bool | None = None) -> FitSettings:
+    """Replace every ``"auto"`` of a config's values by what it stands for.
+
+    Args:
+        values: of a `FitConfig`.
+        views: how many are placed.
+        seed: of the run.
+        held: what ``hold_surface: auto`` comes to; None: no.
+    """
     resolved = dict(values)
-    for name, value in automatic(views).items():
+    if resolved["hold_surface"] != "auto":
+        held = bool(resolved["hold_surface"])
+    for name, value in automatic(views, bool(held)).items():
         if resolved[name] == "auto":
             resolved[name] = value
     if resolved["densify_until_iter"] == "auto":

@@ -18,7 +18,7 @@ class FitStage(Stage):
     """views + cameras + points (+ flow) -> gaussians + refined cameras."""
 
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     summary: ClassVar[str] = "optimise Gaussians and camera poses against the photographs"
     Config: ClassVar[type[StageConfig]] = FitConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras", "points")
@@ -35,6 +35,7 @@ class FitStage(Stage):
     def run(self, context: StageContext) -> None:
         from stages.fit.fitting import fit
         from stages.fit.settings import resolve
+        from stages.fit.surface import worth_holding
 
         views: Views = context.load("views")
         cameras: Cameras = context.load("cameras")
@@ -53,7 +54,11 @@ class FitStage(Stage):
                 "photographs hardly match each other: take them closer together and in focus, or "
                 "loosen what the earlier stages prune (sap, align)."
             )
-        settings = resolve(context.config.model_dump(), len(placed), context.seed)
+        placed_cameras = [by_name[view.name] for view in placed]
+        held = worth_holding(
+            placed_cameras, points.positions.astype(float), context.config.hold_min_angle
+        )
+        settings = resolve(context.config.model_dump(), len(placed), context.seed, held)
 
         def report(iteration: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}
@@ -63,7 +68,7 @@ class FitStage(Stage):
         diary.mkdir(parents=True, exist_ok=True)
         context.progress("preparing (a first run compiles its kernels)", 0, 1)
         result = fit(
-            placed, [by_name[view.name] for view in placed], points, flow, settings,
+            placed, placed_cameras, points, flow, settings,
             threads=context.threads, checkpoint=context.scratch / "fit.npz", report=report,
             diary=diary,
         )  # fmt: skip

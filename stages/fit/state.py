@@ -43,6 +43,7 @@ def save_state(trainer: Trainer, path: Path) -> None:
         "psnr": trainer.psnr,
         "best_loss": trainer.best_loss,
         "focal": trainer.focal.state(),
+        "progressive": trainer.progressive.state() if trainer.progressive is not None else None,
     }
     save_checkpoint(path, arrays, facts)
 
@@ -67,6 +68,8 @@ def restore_state(trainer: Trainer, path: Path) -> bool:
     if trainer.held_surface is not None:
         trainer.held_surface.restore(arrays)
     trainer.focal.restore(facts["focal"])
+    if trainer.progressive is not None:
+        trainer.progressive.restore(facts["progressive"])
     trainer.best_loss = facts["best_loss"]
     trainer.curve = [(int(i), loss, psnr, int(n)) for i, loss, psnr, n in arrays["curve"].tolist()]
     state: Any = facts["random"]

@@ -18,6 +18,7 @@ from stages.fit.lens_light import LensLight
 from stages.fit.mcmc import add_noise, add_regularisers, relocate
 from stages.fit.objectives import depth_loss, flow_loss, interpolate, logit
 from stages.fit.poses import PoseOptimizer, SharedFocal
+from stages.fit.progressive import Progressive
 from stages.fit.settings import FitSettings
 from stages.fit.state import restore_state, save_state
 from stages.fit.surface import HeldSurface
@@ -54,6 +55,7 @@ class Trainer:
         settings: FitSettings,
         light: LensLight | None = None,
         held_surface: HeldSurface | None = None,
+        progressive: Progressive | None = None,
     ) -> None:
         """
         Args:
@@ -65,10 +67,12 @@ class Trainer:
             settings: all constants.
             light: gives the colours, in place of the harmonics.
             held_surface: draws Gaussians back to where they started.
+            progressive: brings in the views one after another.
         """
         self.settings = settings
         self.light = light
         self.held_surface = held_surface
+        self.progressive = progressive
         self.targets = targets
         self.extent = extent
         self.packed = packed
@@ -141,8 +145,11 @@ class Trainer:
     def step(self) -> None:
         """One iteration: one view."""
         s = self.settings
+        views = list(range(len(self.targets)))
+        if self.progressive is not None:
+            views = self.progressive.advance(self)
         if not self.queue:
-            self.queue = [int(v) for v in self.random.permutation(len(self.targets))]
+            self.queue = [int(v) for v in self.random.permutation(views)]
         view = self.queue.pop()
         self.iteration += 1
         factor = s.coarse_factor if self.iteration <= s.coarse_fraction * s.iterations else 1
@@ -182,6 +189,22 @@ class Trainer:
         share = max(1 / self.iteration, 0.05)
         self.loss += share * (loss - self.loss)
         self.psnr += share * (psnr - self.psnr)
+
+    def find_pose(self, view: int, rate: float, uncovered: float) -> None:
+        """One step of a view's pose alone, by what the Gaussians cover of its image.
+
+        Args:
+            rate: of learning, radians and units of the frame.
+            uncovered: pixels that let more light through than this say nothing.
+        """
+        target, s = self.targets[view][1], self.settings
+        viewpoint = self.viewpoint(view, target)
+        rendering = rasterize(self.packed, viewpoint, degree=self.degree(), near=s.near)
+        colour = target.colour(self.composited(view, rendering), s.lambda_dssim)
+        d_planes = colour.gradient * (rendering.transmittance <= uncovered)
+        gradients = rendering.backward(d_planes, np.zeros_like(rendering.transmittance))
+        # the frame's origin is in the middle of the scene
+        self.poses.step(view, gradients.pose, rate, pivot=self.poses.poses[view][:, 3].copy())
 
     def _with_depth(self, target: Target) -> bool:
         """Depth and flow take turns, each twice as heavy: they change slowly, and cost channels."""
@@ -337,7 +360,14 @@ class Trainer:
 
     def _check(self) -> None:
         """Raises where the loss has grown beyond what any good moment explains."""
-        if self.iteration < SETTLED:
+        s = self.settings
+        full_size = int(s.coarse_fraction * s.iterations)
+        # what explains small images perfectly starts anew at full size
+        started = full_size if self.iteration > full_size else 0
+        if self.progressive is not None:
+            started = max(started, self.progressive.latest)
+        if self.iteration - started < SETTLED:
+            self.best_loss = np.inf
             return
         self.best_loss = min(self.best_loss, self.loss)
         if self.loss > self.settings.divergence_factor * self.best_loss:

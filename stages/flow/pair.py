@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -53,6 +54,7 @@ class Estimator:
 class Trust:
     """When flow is trusted: see the fields of the same names in the stage's config."""
 
+    mask: Literal["consistency", "none"] = "consistency"
     consistency_relative: float = 0.0
     consistency_absolute: float = 0.25
     depth_tolerance: float = 0.02
@@ -81,7 +83,8 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
 
     A pixel is trusted if the flow there and back agrees (`estimate.consistency_mask`), it starts
     and ends on valid pixels, and no test that applies speaks against it: with pre-warp, the
-    surface is known there and not hidden in the other view; texture; highlights.
+    surface is known there and not hidden in the other view; texture; highlights. With the mask
+    ``"none"`` the valid pixels are all that is asked for.
 
     Args:
         i, j: the views; `camera` and `depth` of both are needed for the pre-warp.
@@ -113,13 +116,14 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
     results = []
     for index, (a, b) in enumerate(((i, j), (j, i))):
         flow, other = flows[index], 1 - index
-        mask = estimate.consistency_mask(
-            flow, flows[other], residuals[index], residuals[other],
-            trust.consistency_relative, trust.consistency_absolute,
-        )  # fmt: skip
-        mask &= _usable(a, trust) & estimate.lands_on(flow, _usable(b, trust))
+        mask = _usable(a, trust) & estimate.lands_on(flow, _usable(b, trust))
+        if trust.mask == "consistency":
+            mask &= estimate.consistency_mask(
+                flow, flows[other], residuals[index], residuals[other],
+                trust.consistency_relative, trust.consistency_absolute,
+            )  # fmt: skip
         prediction = predictions[index]
-        if prediction is not None and estimator.prewarp:
+        if prediction is not None and estimator.prewarp and trust.mask == "consistency":
             assert b.depth is not None
             mask &= prediction.known & ~geometry.occluded(
                 prediction.flow, prediction.depth_in_other, b.depth, trust.depth_tolerance
@@ -152,6 +156,8 @@ def _size(side: Side) -> tuple[int, int]:
 
 def _usable(side: Side, trust: Trust) -> Mask:
     usable = side.valid
+    if trust.mask == "none":
+        return usable
     if trust.min_texture > 0:
         usable = usable & estimate.textured(side.gray(), trust.min_texture)
     if trust.highlight_level < 1:

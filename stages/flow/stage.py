@@ -56,6 +56,11 @@ class FlowConfig(StageConfig):
         description="Widest angle between the views of a pair, degrees (where cameras are known). "
         "Without pre-warp, flow is mostly wrong from about 12 degrees on.",
     )  # fmt: skip
+    mask: Literal["consistency", "none"] = Field(
+        "consistency",
+        description="Trust flow where there and back agree and no other test speaks against it; "
+        "none: everywhere (an ablation).",
+    )
     consistency_relative: float = Field(
         0.0, ge=0, le=1,
         description="Forward-backward test: tolerated share of the squared motion (with "
@@ -149,8 +154,8 @@ def _run(context: StageContext) -> None:
         smoothing=config.prewarp_smoothing,
     )
     trust = Trust(
-        config.consistency_relative, config.consistency_absolute, config.depth_tolerance,
-        config.min_texture, config.highlight_level,
+        config.mask, config.consistency_relative, config.consistency_absolute,
+        config.depth_tolerance, config.min_texture, config.highlight_level,
     )  # fmt: skip
     results: list[FlowPair] = []
     deviations = []
@@ -205,7 +210,8 @@ def _choose_pairs(
 
     Without cameras (None) the viewing order is that of the views, and no angle is known.
     """
-    from stages.flow.order import neighbour_pairs, parallax_angle, viewing_order
+    from stages.flow.order import neighbour_pairs, parallax_angle
+    from stages.geometry.order import viewing_order
 
     if cameras is None:
         order = list(range(len(views)))

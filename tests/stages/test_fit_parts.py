@@ -8,12 +8,12 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from stages.fit.config import FitConfig
 from stages.fit.density import rotations
-from stages.fit.initial import Cloud, Frame, smooth_normals, thin
+from stages.fit.initial import Cloud, smooth_normals, thin
 from stages.fit.mcmc import add_noise, add_regularisers, relocate, shared
 from stages.fit.poses import SharedFocal
-from stages.fit.scene import Scene, out_of_place, trusted_points
+from stages.fit.scene import out_of_place, trusted_points
 from stages.fit.settings import resolve
-from stages.fit.surface import HeldSurface, along_normals
+from stages.fit.surface import HeldSurface, along_normals, worth_holding
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -168,19 +168,25 @@ def test_the_shared_focal_walks_to_where_its_gradient_ends() -> None:
 
 
 def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
-    def scene(angles: list[float]) -> Scene:
+    def held(angles: list[float]) -> bool:
         cameras = []
         for angle in np.radians(angles):
             c, s = np.cos(angle), np.sin(angle)
             pose = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, 1], [0, 0, 0, 1]], float)
             cameras.append(Camera(str(angle), 64, 48, 70.0, 70.0, 32.0, 24.0, pose))
-        cloud = Cloud(*(np.zeros((5, 3)),) * 3, np.ones(5))
-        frame = Frame(np.zeros(3), 1.0)
-        return Scene((), tuple(cameras), cloud, np.ones(5, bool), frame, {}, [])
+        return worth_holding(cameras, np.zeros((5, 3)), 30.0)
 
-    settings = resolve(FitConfig().model_dump(), 3, 0)
-    assert scene([-45, 0, 45]).holds(settings)
-    assert not scene([-45, 0, 20]).holds(settings)
-    assert not scene([-60, -25, 10, 45]).holds(settings)
-    off = resolve(FitConfig(hold_surface=False).model_dump(), 3, 0)
-    assert not scene([-45, 0, 45]).holds(off)
+    assert held([-45, 0, 45])
+    assert not held([-45, 0, 20])
+    assert not held([-60, -25, 10, 45])
+
+
+def test_what_a_held_surface_changes_unless_the_user_says_otherwise() -> None:
+    free = resolve(FitConfig().model_dump(), 3, 0)
+    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    assert not free.hold_surface and held.hold_surface
+    assert held.initial_points > free.initial_points
+    off = resolve(FitConfig(hold_surface=False).model_dump(), 3, 0, held=True)
+    assert off == free
+    chosen = resolve(FitConfig(hold_surface=True, sh_degree=0).model_dump(), 3, 0)
+    assert chosen.hold_surface and chosen.sh_degree == 0

@@ -14,8 +14,8 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
 from stages.fit.initial import Cloud, initial_gaussians
-from stages.fit.poses import exponential
 from stages.fit.stage import FitConfig, FitStage
+from stages.geometry.rigid import exponential
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack
 
