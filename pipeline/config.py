@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -31,12 +31,14 @@ class RunConfig(BaseModel):
         stages: the stages of a whole run, in order.
         seed: all randomness comes from it.
         threads: 0 means all cores that the process may use. Never changes the result.
+        report: write ``report.html`` into the workspace when a run ends.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     stages: tuple[str, ...] = Field(min_length=1)
     seed: int = Field(0, ge=0, lt=2**32)
     threads: int = Field(0, ge=0, le=1024)
+    report: bool = True
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,15 @@ def load_config(
 
     Args:
         preset: name of a preset that comes with dentalsplat, or a YAML file; None for the default.
-        overrides: ``"sap.quantile=0.99"`` strings, or a mapping ``{"sap.quantile": 0.99}``.
+        overrides: ``"sap.quantile=0.99"`` strings, or a mapping ``{"sap.quantile": 0.99}``;
+            settings of the run as ``threads=2`` or ``run.threads=2``.
 
     Raises:
         RequestError: unknown preset, stage or key (with the nearest match), or a value that is not
             allowed.
     """
     tree = _read_preset(preset or DEFAULT_PRESET, seen=())
-    pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
+    pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
     for key, value in pairs:
         _set(tree, key, value)
     run_fields = set(RunConfig.model_fields)
@@ -78,14 +81,14 @@ def load_config(
                 f"'{name}' is neither a stage nor a setting of a run; known are "
                 f"{', '.join(known)}.{nearest(name, known)}"
             )
-    run = _validate(RunConfig, {k: v for k, v in tree.items() if k in run_fields}, "")
+    run = validate(RunConfig, {k: v for k, v in tree.items() if k in run_fields}, "")
     for name in run.stages:
         if name not in sections:
             get_stage(name)  # raises, naming the nearest
     return Config(
         run=run,
         sections={
-            name: _validate(stage.Config, tree.get(name) or {}, name)
+            name: validate(stage.Config, tree.get(name) or {}, name)
             for name, stage in usable_stages().items()
         },
     )
@@ -116,10 +119,7 @@ def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         chain = " -> ".join(entry.name for entry in (*seen, path))
         raise RequestError(f"The presets extend each other in a circle: {chain}.")
-    try:
-        tree = _yaml(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise RequestError(f"The preset {path} can't be read: {error}") from error
+    tree = read_yaml(path, "preset")
     if not isinstance(tree, dict):
         raise RequestError(f"The preset {path} must be a mapping with a section per stage.")
     base = tree.pop("extends", None)
@@ -141,6 +141,21 @@ def _find_preset(preset: str | Path, seen: tuple[Path, ...]) -> Path:
         f"There is no preset '{preset}'. The presets are {', '.join(known)}; or give a YAML file."
         f"{nearest(str(preset), known)}"
     )
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """The content of a YAML file.
+
+    Args:
+        what: what the file is, for the error message.
+
+    Raises:
+        RequestError: it can't be read.
+    """
+    try:
+        return _yaml(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise RequestError(f"The {what} {path} can't be read: {error}") from error
 
 
 class _YamlLoader(yaml.SafeLoader):
@@ -168,7 +183,7 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise RequestError(
@@ -181,7 +196,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    *parents, last = dotted.split(".")
+    *parents, last = dotted.removeprefix("run.").split(".")
     for name in parents:
         child = tree.get(name)
         if not isinstance(child, dict):
@@ -191,7 +206,15 @@ def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
     tree[last] = value
 
 
-def _validate(model: type[Model], values: Any, section: str) -> Model:
+def validate(model: type[Model], values: Any, section: str) -> Model:
+    """Values as read from YAML -> a model.
+
+    Args:
+        section: where the values stand, for the error message.
+
+    Raises:
+        RequestError: with a sentence per wrong field, and the nearest match of an unknown one.
+    """
     if not isinstance(values, dict):
         raise RequestError(f"The section '{section}' must hold key: value pairs.")
     try:
@@ -221,21 +244,30 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
 def _description(model: type[BaseModel], location: list[str]) -> str | None:
     """What the innermost field at a location is for."""
     about = None
+    inner: type[BaseModel] | None = model
     for part in location:
-        if part not in model.model_fields:
+        if part.isdigit():  # an entry of a list
+            continue
+        if inner is None or part not in inner.model_fields:
             break
-        about = model.model_fields[part].description
-        inner = model.model_fields[part].annotation
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            break
-        model = inner
+        about = inner.model_fields[part].description
+        inner = _model_in(inner.model_fields[part].annotation)
     return about
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    inner: type[BaseModel] | None = model
     for part in location:
-        inner = model.model_fields[part].annotation
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+        if part.isdigit():
+            continue
+        if inner is None or part not in inner.model_fields:
             return []
-        model = inner
-    return list(model.model_fields)
+        inner = _model_in(inner.model_fields[part].annotation)
+    return list(inner.model_fields) if inner else []
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model that a field holds, directly, optionally or as a list of it."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_model_in, get_args(annotation))), None)

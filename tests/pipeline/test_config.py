@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import _parse_override, load_config, presets, result_fields
+from pipeline.config import load_config, parse_override, presets, result_fields
 from pipeline.errors import RequestError
 from pipeline.request import _yaml_value
 
@@ -76,7 +76,7 @@ def test_runtime_fields_stay_out_of_the_result(toys: Path) -> None:
 
 @given(st.one_of(st.integers(), st.floats(allow_nan=False), st.booleans(), st.text(), st.none()))
 def test_values_survive_the_command_line(value: object) -> None:
-    key, parsed = _parse_override(f"a.b={_yaml_value(value)}")
+    key, parsed = parse_override(f"a.b={_yaml_value(value)}")
     assert key == "a.b"
     assert parsed == value
 
@@ -92,4 +92,4 @@ def test_values_survive_the_command_line(value: object) -> None:
     ],
 )
 def test_on_and_off_are_words(text: str, value: object) -> None:
-    assert _parse_override(text) == ("a.b", value)
+    assert parse_override(text) == ("a.b", value)
