@@ -25,7 +25,10 @@ dentalsplat turns a few photographs of teeth into a 3D scene that you can turn a
   pipeline run -w cases/anna --from fit             again from a stage on
 
   pipeline status -w cases/anna             what is cached, what is stale and why
+  pipeline report -w cases/anna             one page about all of it (a run writes it as well)
   pipeline stages                           the stages, their methods and settings
+  pipeline compare -w cases/anna --run-colmap       beside COLMAP on the same photographs
+  pipeline benchmark smoke                  methods side by side, in the paper's tables
   pipeline doctor                           is everything installed?
   pipeline clean -w cases/anna              delete results that are not in use
 
@@ -151,6 +154,14 @@ def status_command(
         print_status(found)
 
 
+@app.command("report")
+def report_command(workspace: Workspace = None) -> None:
+    """Write WORKSPACE/report.html: what came out, how sure it is, and everything behind it."""
+    from pipeline.report import run_report
+
+    print(run_report(workspace or _only_workspace()))
+
+
 @app.command("stages")
 def stages_command(as_json: AsJson = False) -> None:
     """List the registered stages and methods, with what they require and provide."""
@@ -177,6 +188,90 @@ def doctor_command(as_json: AsJson = False) -> None:
         print_findings(found)
     if any(entry.level == "problem" for entry in found):
         raise typer.Exit(1)
+
+
+@app.command("compare")
+def compare_command(
+    workspace: Workspace = None,
+    colmap: Annotated[
+        Path | None,
+        typer.Option("--colmap", help="Folder of a COLMAP model of the same photographs."),
+    ] = None,
+    run_colmap: Annotated[
+        bool, typer.Option("--run-colmap", help="Run COLMAP here, with two settings.")
+    ] = False,
+    ground_truth: Annotated[
+        Path | None,
+        typer.Option("--ground-truth", help="True cameras: transforms.json or a COLMAP model."),
+    ] = None,
+    mesh: Annotated[
+        Path | None, typer.Option("--mesh", help="True surface, in the frame of --ground-truth.")
+    ] = None,
+    fit: Annotated[
+        bool, typer.Option("--fit/--no-fit", help="Also fit from COLMAP's cameras and points.")
+    ] = True,
+    threads: Annotated[int, typer.Option("--threads", min=0, help="0: all cores.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Set the cameras, points and fit of a run beside COLMAP's on the same views.
+
+    To run the pipeline itself on COLMAP's results: --set init.cameras=MODEL takes its cameras from
+    the start (init.points=model: its points too), and --stages views,init,align,swap,sap,flow,fit
+    --set swap.cameras=MODEL puts them in place of ours after any stage; fit.optimize_poses=false
+    keeps them. Results: WORKSPACE/compare/comparison.json, comparison.md and report.html.
+    """
+    from pipeline.progress import make_reporter
+    from stages.comparison.compare import compare
+    from stages.comparison.tables import print_tables, tables_of
+
+    found = compare(
+        workspace or _only_workspace(), colmap=colmap, run_colmap=run_colmap,
+        ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads, reporter=make_reporter(),
+    )  # fmt: skip
+    if as_json:
+        print(json.dumps(found.figures, indent=1))
+    else:
+        print_tables(tables_of(found.figures))
+        print(f"\nResults: {found.folder}/")
+
+
+@app.command("benchmark")
+def benchmark_command(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite's name, or a YAML file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Folder of the results.  [default: ./runs/benchmark_SUITE]"
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", help="Where the suite's data are, if not where it says."),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", min=1, help="Workspaces at a time; they share the cores.")
+    ] = 1,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare methods on scenes and numbers of views, and write the paper's tables of them.
+
+    For example: pipeline benchmark smoke -o runs/smoke; or, with the data of a suite elsewhere:
+    pipeline benchmark configs/suites/paper.yaml --data ../data --jobs 2. Finished cells are not run
+    again. Results: tables.md, tables.csv, results.json and report.html.
+    """
+    from pipeline.benchmarking.running import benchmark
+    from pipeline.benchmarking.writing import markdown
+
+    results = benchmark(
+        suite, out=out, data=data, jobs=jobs, overrides=overrides or [],
+        say=lambda text: print(text, file=sys.stderr, flush=True),
+    )  # fmt: skip
+    print(json.dumps(results, indent=1) if as_json else markdown(results), end="\n" * as_json)
+    if results["problems"]:
+        print("\n" + "\n".join(results["problems"]), file=sys.stderr)
+        faults = any(cell["status"] == "fault" for cell in results["cells"])
+        raise typer.Exit(1 if faults else 2)
 
 
 @app.command("clean")

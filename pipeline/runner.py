@@ -52,12 +52,14 @@ class RunSummary:
     workspace: Path
     stages: list[StageOutcome] = field(default_factory=list)
     results: Path | None = None
+    report: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON values."""
         return {
             "workspace": str(self.workspace),
             "results": str(self.results) if self.results else None,
+            "report": str(self.report) if self.report else None,
             "stages": [
                 {**vars(s), "folder": str(s.folder) if s.folder else None} for s in self.stages
             ],
@@ -183,9 +185,28 @@ class Runner:
         self.reporter.start(list(self.chain.names))
         try:
             self._check_upstream()
-            return self._run_all(force)
+            summary = self._run_all(force)
+            summary.report = self._write_report()
+            return summary
+        except (ReconstructionError, StageError):
+            report = self._write_report()
+            if report is not None:
+                self.reporter.message(f"What came of it so far: {report}")
+            raise
         finally:
             self.reporter.stop()
+
+    def _write_report(self) -> Path | None:
+        """Write the report; whatever goes wrong with it is said, and harms nothing else."""
+        if not self.config.run.report:
+            return None
+        from pipeline.report import run_report
+
+        try:
+            return run_report(self.request.workspace)
+        except Exception as error:
+            self.reporter.message(f"The report could not be written: {error}")
+            return None
 
     def _dry_run(self, force: bool) -> RunSummary:
         summary = RunSummary(self.request.workspace)

@@ -10,6 +10,7 @@ Layout of a workspace::
     WORKSPACE/<stage>/failure/            pictures that show it, where there are any
     WORKSPACE/request.json                what was asked for last
     WORKSPACE/results                     link to the exports in use
+    WORKSPACE/report.html                 what the last run did, for people
 """
 
 from __future__ import annotations

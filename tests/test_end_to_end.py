@@ -14,17 +14,11 @@ from pipeline.runner import RunSummary
 from pipeline.store import Store
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
-SHORT = {
-    "fit.iterations": 150,
-    "export.video_seconds": 1,
-    "export.mesh_faces": 5000,
-}
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    folder = tmp_path_factory.mktemp("case") / "w"
-    return pipeline.run(SAMPLES, workspace=folder, overrides=SHORT)
+def done(sample_run: RunSummary) -> RunSummary:
+    return sample_run
 
 
 def test_every_stage_ran_and_told_its_figures(done: RunSummary) -> None:
@@ -71,10 +65,10 @@ def test_nothing_exported_names_the_source_files(done: RunSummary) -> None:
 
 
 def test_second_run_is_cached_and_a_setting_reruns_only_what_depends_on_it(
-    done: RunSummary,
+    done: RunSummary, short_settings: dict[str, int]
 ) -> None:
     def actions(*overrides: str, **options: object) -> dict[str, str]:
-        settings = [f"{key}={value}" for key, value in SHORT.items()]
+        settings = [f"{key}={value}" for key, value in short_settings.items()]
         summary = pipeline.run(
             SAMPLES, workspace=done.workspace, overrides=[*settings, *overrides], **options
         )  # type: ignore[arg-type]

@@ -1,0 +1,115 @@
+"""Directions to look from, and bringing cameras of two stages into one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+
+Array = npt.NDArray[np.float64]
+
+
+def scene_frame(cameras: Sequence[Camera]) -> Array:
+    """[3, 3] rotation from the world to a frame with the cameras' mean right, down and ahead."""
+    if not cameras:
+        return np.eye(3)
+    ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
+    if np.linalg.norm(ahead) < 1e-3:  # cameras all around
+        ahead = cameras[0].rotation[2]
+    ahead = ahead / np.linalg.norm(ahead)
+    down = np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    down = down - (down @ ahead) * ahead
+    if np.linalg.norm(down) < 1e-3:
+        down = cameras[0].rotation[1] - (cameras[0].rotation[1] @ ahead) * ahead
+    down = down / np.linalg.norm(down)
+    return np.stack([np.cross(down, ahead), down, ahead])
+
+
+def three_quarter(frame: Array, azimuth: float = 35.0, elevation: float = 18.0) -> Array:
+    """[3, 3] the frame turned to look from the side and from above, degrees."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    side = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    above = np.array([[1, 0, 0], [0, np.cos(e), -np.sin(e)], [0, np.sin(e), np.cos(e)]])
+    return np.asarray(above @ side @ frame)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """new = scale * rotation @ old + shift."""
+
+    scale: float
+    rotation: Array
+    shift: Array
+
+    def points(self, points: npt.NDArray[np.floating]) -> Array:
+        """Move points [N, 3]."""
+        return np.asarray(
+            self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.shift
+        )
+
+    def camera_rotation(self, camera: Camera) -> Array:
+        """[3, 3] the camera's rotation from the new world."""
+        return np.asarray(camera.rotation @ self.rotation.T)
+
+
+def similarity_onto(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Similarity:
+    """The similarity that brings cameras onto others of the same views (least squares).
+
+    Rotations come from the mean relative rotation, scale and shift from the centres, so that two
+    cameras, or a straight line of them, are enough (Horn 1987 for the mean of rotations).
+
+    Args:
+        cameras, targets: the same views in the same order, at least one.
+    """
+    total = np.sum(
+        [goal.rotation.T @ camera.rotation for camera, goal in zip(cameras, targets, strict=True)],
+        axis=0,
+    )
+    u, _, vt = np.linalg.svd(total)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    centres = np.array([camera.centre for camera in cameras]) @ rotation.T
+    goals = np.array([camera.centre for camera in targets])
+    a, b = centres - centres.mean(0), goals - goals.mean(0)
+    spread = float((a**2).sum())
+    scale = float((a * b).sum() / spread) if spread > 1e-18 else 1.0
+    scale = scale if scale > 1e-9 else 1.0
+    return Similarity(scale, rotation, goals.mean(0) - scale * centres.mean(0))
+
+
+def movement(
+    cameras: Sequence[Camera], targets: Sequence[Camera]
+) -> list[tuple[str, float, float]]:
+    """How far each camera moved: (view, degrees, percent of the largest distance of two cameras).
+
+    Args:
+        cameras, targets: before and after, by any order; views that both have are compared.
+    """
+    after = {camera.name: camera for camera in targets}
+    pairs = [(camera, after[camera.name]) for camera in cameras if camera.name in after]
+    if not pairs:
+        return []
+    onto = similarity_onto([a for a, _ in pairs], [b for _, b in pairs])
+    goals = np.array([b.centre for _, b in pairs])
+    size = float(np.linalg.norm(goals[:, None] - goals[None], axis=-1).max()) or 1.0
+    found = []
+    for before, goal in pairs:
+        cosine = (np.trace(onto.camera_rotation(before) @ goal.rotation.T) - 1) / 2
+        turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        shift = float(np.linalg.norm(onto.points(before.centre[None])[0] - goal.centre))
+        found.append((before.name, turn, 100 * shift / size))
+    return found
+
+
+def frustum(camera: Camera, onto: Similarity | None, depth: float) -> Array:
+    """The 5 corners [5, 3] of a camera's pyramid in the world: centre, then the image's corners."""
+    halves = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (
+        camera.width / 2 / camera.fx, camera.height / 2 / camera.fy,
+    )  # fmt: skip
+    local = np.vstack([np.zeros(3), np.column_stack([halves, np.ones(4)]) * depth])
+    moved = onto or Similarity(1.0, np.eye(3), np.zeros(3))
+    rotation = moved.camera_rotation(camera)
+    return np.asarray(local @ rotation + moved.points(camera.centre[None]))

@@ -1,0 +1,74 @@
+"""The templates, and how numbers are written."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import RequestError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+@cache
+def environment() -> Environment:
+    """The templates; all text that goes into them is escaped."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    def source(name: str) -> str:
+        return (files("pipeline.report") / name).read_text(encoding="utf-8")
+
+    made = Environment(
+        loader=FunctionLoader(source), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    made.filters["number"] = number
+    made.filters["seconds"] = seconds
+    return made
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """A figure for people: ``1,234``, ``0.83``; a dash for what is not known."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if not math.isfinite(value):
+        return "–"
+    if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
+        return f"{int(value):,}"
+    return f"{value:,.{digits}f}"
+
+
+def seconds(value: float | None) -> str:
+    """A time for people: ``0.4 s``, ``12 s``, ``3 min 20 s``."""
+    if value is None:
+        return "–"
+    if value < 10:
+        return f"{value:.1f} s"
+    if value < 120:
+        return f"{value:.0f} s"
+    return f"{int(value // 60)} min {value % 60:.0f} s"
+
+
+def write_page(template: str, out: Path, **content: Any) -> Path:
+    """Fill a template and replace the file in one step.
+
+    Raises:
+        RequestError: the folder can't be written to.
+    """
+    text = environment().get_template(template).render(**content)
+    temporary = out.with_name(f".{out.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(out)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise RequestError(f"The report {out} can't be written ({error.strerror}).") from error
+    return out

@@ -1,0 +1,326 @@
+"""The report of a run: what it says of good, partial and failed runs, and what a browser sees."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.errors import ReconstructionError, RequestError
+from pipeline.report import run_report
+from pipeline.report.geometry import movement, similarity_onto
+from pipeline.report.pictures import flow_colors, picture, points_image, thirds
+from pipeline.report.tables import views_table
+from pipeline.runner import RunSummary
+from stages.evaluate.pictures import comparison
+from stages.geometry.world import move_camera
+
+_spec = util.spec_from_file_location("report_case", Path(__file__).with_name("report_case.py"))
+assert _spec and _spec.loader
+case = util.module_from_spec(_spec)
+_spec.loader.exec_module(case)
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+
+
+def text_of(page: str) -> str:
+    """What a reader sees: without pictures, styles and tags."""
+    page = re.sub(r"<(style|script|svg)\b.*?</\1>", " ", page, flags=re.S)
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", " ", page)))
+
+
+def sections_of(page: str) -> list[str]:
+    return re.findall(r"<summary>([\w -]+?) ?<", page)
+
+
+def assert_alone(page: str) -> None:
+    """Nothing in the page leads to a file or an address that a browser would fetch."""
+    outside = re.findall(
+        r"<(?:script|link|img|iframe|source)[^>]*(?:src|href)=[\"'](?!data:)", page
+    )
+    assert outside == []
+    assert not re.search(r"url\((?!#|\"?data:)", page)
+    assert "@import" not in page
+    assert "default-src 'none'" in page
+
+
+def test_everything_that_is_there_is_shown(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "case")
+    file = run_report(workspace)
+    assert file == workspace / "report.html"
+    page = file.read_text()
+    text = text_of(page)
+    assert sections_of(page) == [
+        "Photographs", "Matches", "Cameras", "Points", "Flow", "Fit",
+        "Renders beside the photographs", "Held-out photographs", "Figures", "Time and memory",
+        "Stages and keys", "Settings", "run", *case.CHAIN, "Versions",
+    ]  # fmt: skip
+    for said in (
+        "3 of 3 photographs placed", "25.00 dB PSNR of the input photographs (training views)",
+        "21.00 dB PSNR of photographs held out (registered cameras)", "1,234 Gaussians",
+        "1 photograph was held out", "21.00 dB (registered cameras), 22.00 dB (refined cameras)",
+        "20 degrees beyond the outermost photographs, 25 % of what the scene shows was never",
+        "within 0.40 pixels", "Lengths have no unit", "not how right it is from directions",
+        "40 of 50 matches verified", "after sap: 300 points", "after align: 500 points",
+        "rotation error, degrees, median 0.120", "Magenta: unseen.", "kept_back.jpg",
+        "LPIPS is empty", "numpy 1.2.3", "fit.iterations=20",
+    ):  # fmt: skip
+        assert said in text, said
+    assert "could not be drawn" not in text
+    assert_alone(page)
+    assert page.count("<svg xmlns") == 6, "matrix, two of the cameras, three of the fit"
+    for image in re.findall(r"<img[^>]*>", page.partition("<dialog")[0]):
+        assert re.search(r'alt="[^"]{5,}"', image), image[-200:]
+
+
+def test_names_and_warnings_are_text_and_not_markup(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "<i>case&", unplaced=True)
+    page = run_report(workspace).read_text()
+    assert "<b>x" not in page
+    assert "<script>alert" not in page
+    assert "<i>case" not in page
+    text = text_of(page)
+    assert case.HOSTILE in text
+    assert "<i>case&" in text
+    assert "<script>alert(1)</script>" in text
+    assert "2 of 3 photographs placed in space" in text
+    assert "1 of 3 photographs could not be placed and are not part of the scene: right.jpg" in text
+    assert re.search(r"not placed 1 of 3 photographs could not be placed: right", text)
+
+
+def test_stages_that_did_not_run_leave_no_gap(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "case", ("views", "init", "sap", "fit"))
+    page = run_report(workspace).read_text()
+    assert sections_of(page)[:5] == ["Photographs", "Matches", "Cameras", "Points", "Fit"]
+    assert "Figures" not in sections_of(page)
+    text = text_of(page)
+    assert "after align" not in text
+    assert "PSNR of the input" not in text
+    assert "could not be drawn" not in text
+
+
+def test_a_damaged_picture_costs_only_its_part(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "case")
+    (cloud,) = (workspace / "sap").glob("*/points/points.ply")
+    cloud.write_bytes(cloud.read_bytes()[:100].ljust(cloud.stat().st_size, b"\0"))
+    page = run_report(workspace).read_text()
+    assert "The part 'points' could not be drawn" in text_of(page)
+    assert {"Photographs", "Matches", "Flow", "Figures"} <= set(sections_of(page))
+
+
+def test_no_workspace(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="not a workspace"):
+        run_report(tmp_path)
+
+
+# -- the building blocks ---------------------------------------------------------------------------
+
+
+def test_cameras_of_two_stages_are_brought_together() -> None:
+    before = case.cameras().cameras
+    angle = np.radians(25)
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    after = [move_camera(camera, (1.7, turn, np.array([1.0, -2, 3]))) for camera in before]
+    onto = similarity_onto(before, after)
+    assert onto.scale == pytest.approx(1.7)
+    np.testing.assert_allclose(onto.rotation, turn, atol=1e-12)
+    for _, degrees, percent in movement(before, after):
+        assert degrees == pytest.approx(0, abs=1e-5)
+        assert percent == pytest.approx(0, abs=1e-9)
+    twisted = case.cameras(2.0).cameras
+    moved = {name: degrees for name, degrees, _ in movement(before, twisted)}
+    assert moved["000"] == pytest.approx(2.0, abs=0.01), "the mean turn is taken out"
+    assert moved["001"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_comparisons_are_taken_apart() -> None:
+    photo, render = case.picture(1), case.picture(2)
+    parts = thirds(comparison(render, photo, 0.25))
+    assert parts is not None
+    assert np.array_equal(parts[0], photo)
+    assert np.array_equal(parts[1], render)
+    assert thirds(photo) is None
+
+
+def test_flow_colours_tell_direction_length_and_trust() -> None:
+    flow = np.zeros((4, 6, 2), np.float32)
+    flow[:, :3, 0], flow[:, 3:, 0] = 8, -8
+    flow[0] = 0
+    flow[3, 5] = np.nan
+    trusted = np.ones((4, 6), bool)
+    trusted[2] = False
+    image, largest = flow_colors(flow, trusted)
+    assert largest == pytest.approx(8)
+    right, left = image[1, 0].astype(int), image[1, 5].astype(int)
+    assert right[0] - right[2] > 200, "to the right is red"
+    assert left[2] - left[0] > 200, "to the left is cyan"
+    assert np.ptp(image[0, 0]) == 0, "no motion has no colour"
+    assert (image[2] == 110).all()
+
+
+def test_the_nearest_point_is_on_top() -> None:
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 40)] * 2), -1).reshape(-1, 2)
+    near = np.column_stack([grid, np.full(len(grid), -1.0)])
+    far = np.column_stack([grid, np.full(len(grid), 1.0)])
+    colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(grid), 0)
+    image = points_image(np.vstack([near, far]), colors, np.eye(3), (60, 60))
+    assert (image[30, 30] == (255, 0, 0)).all()
+    image = points_image(np.vstack([near, far]), colors, np.diag([1.0, 1, -1]), (60, 60))
+    assert (image[30, 30] == (0, 0, 255)).all()
+
+
+def test_pictures_are_scaled_down_and_described() -> None:
+    made = picture(np.zeros((300, 1200, 3), np.uint8), "nothing", long_side=400)
+    assert (made.width, made.height) == (400, 100)
+    assert made.uri.startswith("data:image/jpeg;base64,")
+
+
+def test_columns_without_figures_are_left_out() -> None:
+    block = case.scored(["000", "001"], 20.0)
+    table = views_table(block, {"000": "first"})
+    assert table.head == ["view", "PSNR dB", "SSIM", "covered %", "pixels scored %"]
+    assert [cell.text for cell in table.rows[0]] == ["first", "20.00", "0.800", "97.0", "100.0"]
+    assert table.sums[0][1].text == "20.50"
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+PROBE = """<!doctype html><title>probe</title><body>
+<iframe id="wide" style="width: 1200px; height: 900px" srcdoc="PAGE"></iframe>
+<iframe id="phone" style="width: 390px; height: 800px" srcdoc="PAGE"></iframe>
+<script>
+onload = async () => {
+  const result = {};
+  for (const id of ["wide", "phone"]) {
+    const page = document.getElementById(id).contentDocument;
+    for (const entry of page.querySelectorAll("details")) entry.open = true;
+    await new Promise((done) => setTimeout(done, 300));
+    const images = [...page.images].filter((image) => !image.closest("dialog"));
+    const root = page.documentElement;
+    result[id] = {
+      images: images.length,
+      blank: images.filter((image) => !image.naturalWidth).map((image) => image.alt),
+      charts: [...page.querySelectorAll("svg.chart")].map((chart) => {
+        const box = chart.getBBox();
+        return [box.width, box.height, chart.getBoundingClientRect().width];
+      }),
+      overflow: root.scrollWidth - root.clientWidth,
+      requests: performance.getEntriesByType("resource").map((entry) => entry.name)
+        .concat(page.defaultView.performance.getEntriesByType("resource").map((e) => e.name))
+        .filter((name) => !name.startsWith("data:")),
+    };
+  }
+  const page = document.getElementById("wide").contentDocument;
+  const slider = page.querySelector(".compare input");
+  if (slider) {
+    slider.value = 20;
+    slider.dispatchEvent(new Event("input"));
+    result.at = page.querySelector(".compare").style.getPropertyValue("--at");
+    page.querySelector("img.zoom").click();
+    result.zoomed = page.querySelector("dialog").open;
+    const table = page.querySelector("table.sort");
+    table.querySelectorAll("th button")[1].click();
+    result.sorted = [...table.tBodies[0].rows].map((row) => Number(row.cells[1].dataset.v));
+  }
+  const text = document.createElement("pre");
+  text.id = "result";
+  text.textContent = JSON.stringify(result);
+  document.body.append(text);
+};
+</script></body>"""
+
+
+def look(page: Path, folder: Path) -> dict[str, Any]:
+    """Open a report at two widths in headless Chromium; what was drawn, and nothing complained."""
+    assert CHROMIUM
+    file = folder / "probe.html"
+    file.write_text(PROBE.replace("PAGE", html.escape(page.read_text())))
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+        "--no-first-run", "--disable-background-networking", "--disable-component-update",
+        "--disable-sync", "--window-size=1300,1000", "--virtual-time-budget=4000",
+        f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--v=0", "--dump-dom",
+        f"file://{file}",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    complaints = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    assert complaints == []
+    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.S)
+    assert found, done.stderr[-2000:]
+    result: dict[str, Any] = json.loads(html.unescape(found[1]))
+    for width in ("wide", "phone"):
+        seen = result[width]
+        assert seen["blank"] == []
+        assert seen["overflow"] <= 0
+        assert seen["requests"] == []
+        assert all(w > 100 and h > 100 and shown > 100 for w, h, shown in seen["charts"])
+    return result
+
+
+@needs_chromium
+def test_a_browser_draws_every_figure_of_a_real_run(sample_run: RunSummary, tmp_path: Path) -> None:
+    assert sample_run.report == sample_run.workspace / "report.html"
+    page = run_report(sample_run.workspace)
+    text = text_of(page.read_text())
+    assert "could not be drawn" not in text
+    assert "could not be told" not in text
+    assert page.stat().st_size < 4e6
+    assert_alone(page.read_text())
+    seen = look(page, tmp_path)
+    assert seen["wide"]["images"] > 20
+    assert len(seen["wide"]["charts"]) == 6
+    assert seen["at"] == "20%"
+    assert seen["zoomed"] is True
+    assert len(seen["sorted"]) >= 3
+    shot = tmp_path / "shot.png"
+    subprocess.run(
+        [CHROMIUM or "", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+         "--window-size=1200,1600", f"--user-data-dir={tmp_path / 'second'}",
+         f"--screenshot={shot}", f"file://{page}"],
+        capture_output=True, timeout=120, check=True,
+    )  # fmt: skip
+    drawn = cv2.imread(str(shot))
+    assert drawn.shape == (1600, 1200, 3)
+    assert drawn[400:].reshape(-1, 3).std(0).min() > 20, "pictures, not a blank page"
+
+
+@needs_chromium
+def test_a_browser_draws_whatever_is_there(tmp_path: Path) -> None:
+    page = run_report(case.write_case(tmp_path / "a<b>&", unplaced=True))
+    seen = look(page, tmp_path)
+    assert len(seen["phone"]["charts"]) == 6
+    assert seen["sorted"] == sorted(seen["sorted"], reverse=True) or len(seen["sorted"]) == 2
+
+
+# -- from a run ------------------------------------------------------------------------------------
+
+
+def test_a_run_that_fails_is_reported_with_its_diagnosis(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    rng = np.random.default_rng(0)
+    for name in ("<b>a&.jpg", "b.jpg"):
+        blur = cv2.GaussianBlur(rng.normal(0.5, 0.6, (120, 160, 3)), (0, 0), 1.5)
+        cv2.imwrite(str(photos / name), np.clip(blur * 255, 0, 255).astype(np.uint8))
+    with pytest.raises(ReconstructionError):
+        pipeline.run(photos, workspace=tmp_path / "w", overrides={"init.method": "colmap"})
+    page = (tmp_path / "w" / "report.html").read_text()
+    text = text_of(page)
+    assert "init failed" in text
+    failure = json.loads((tmp_path / "w" / "init" / "failure.json").read_text())["message"]
+    assert failure.partition(" Pictures that")[0] in text
+    assert "2 read" in text
+    assert "<b>a" not in page
