@@ -8,8 +8,8 @@ A Markdown table is printed, and kept with the figures in DIR, where a later run
 
 Rotation errors are those between all pairs of cameras; translation errors those of the centres
 after similarity alignment, in % of the largest distance. COLMAP gets the photographs in full size
-and the hint that all are of one camera. Its sparse setting is that of `SPARSE` below. CPU seconds
-compare on any machine, wall seconds on an idle one.
+and the hint that all are of one camera. Its sparse setting is that of `pipeline compare`. CPU
+seconds compare on any machine, wall seconds on an idle one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -31,27 +29,14 @@ from init_scores import Truth, read_truth, rotation_errors, score_points, transl
 
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext, get_stage
+from stages.comparison.colmap_run import SETTINGS, Job, run_job
+from stages.comparison.models import model_folders
+from stages.geometry.known_cameras import model_files, read_cameras
 
 METHODS = ("colmap", "sparse", "ours")
 
-#: What helps COLMAP where there are few views.
-SPARSE: dict[str, Any] = {
-    "extraction": {"sift.peak_threshold": 0.002, "sift.max_num_features": 12_000},
-    "matching": {"sift.max_ratio": 0.88},
-    "verification": {"min_num_inliers": 12},
-    "mapping": {
-        "min_model_size": 2,
-        "min_num_matches": 8,
-        "mapper.init_min_num_inliers": 30,
-        "mapper.init_min_tri_angle": 2.0,
-        "mapper.init_max_forward_motion": 1.0,
-        "mapper.abs_pose_min_num_inliers": 10,
-        "mapper.abs_pose_min_inlier_ratio": 0.1,
-        "mapper.filter_min_tri_angle": 1.0,
-        "triangulation.min_angle": 1.0,
-        "triangulation.ignore_two_view_tracks": False,
-    },
-}
+#: COLMAP's settings by method (`stages.comparison.colmap_run`).
+COLMAP_SETTINGS = {"colmap": "defaults", "sparse": "sparse"}
 
 COLUMNS = {
     "case": "set", "method": "method", "placed": "placed", "rotation": "rotation, deg",
@@ -129,72 +114,34 @@ class Placed:
     focals: dict[str, float]
 
 
-def run_colmap(files: tuple[Path, ...], setting: str) -> tuple[Placed, float, float]:
+def run_colmap(files: tuple[Path, ...], method: str, threads: int) -> tuple[Placed, float, float]:
     """COLMAP in a process of its own: cameras, wall and CPU seconds."""
     with tempfile.TemporaryDirectory() as scratch:
-        images = Path(scratch) / "images"
-        images.mkdir()
+        folder = Path(scratch)
+        (folder / "images").mkdir()
         for path in files:
-            (images / path.name).symlink_to(path.resolve())
+            (folder / "images" / path.name).symlink_to(path.resolve())
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        start = time.perf_counter()
-        command = [sys.executable, __file__, "--colmap", setting, scratch]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        wall = time.perf_counter() - start
+        done = run_job(folder, Job(SETTINGS[COLMAP_SETTINGS[method]], threads=threads))
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        if done["failure"]:
+            raise RuntimeError(done["failure"])
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        return read_placed(Path(scratch) / "cameras.json"), wall, cpu
+        return read_placed(folder / "sparse"), done["seconds"], cpu
 
 
-def read_placed(path: Path) -> Placed:
-    found = json.loads(path.read_text())
-    return Placed({name: np.array(pose) for name, (pose, _) in found.items()},
-                  {name: focal for name, (_, focal) in found.items()})  # fmt: skip
-
-
-def colmap_here(setting: str, folder: Path) -> None:
-    """Run COLMAP on `folder/images` and write `folder/cameras.json`: the subprocess."""
-    import pycolmap
-
-    chosen = SPARSE if setting == "sparse" else {}
-
-    def options(made: Any, step: str) -> Any:
-        for name, value in chosen.get(step, {}).items():
-            *parents, leaf = name.split(".")
-            target = made
-            for parent in parents:
-                target = getattr(target, parent)
-            setattr(target, leaf, value)
-        return made
-
-    database = folder / "database.db"
-    pycolmap.extract_features(
-        database, folder / "images", camera_mode=pycolmap.CameraMode.SINGLE,
-        extraction_options=options(pycolmap.FeatureExtractionOptions(), "extraction"),
-        device=pycolmap.Device.cpu,
-    )  # fmt: skip
-    pycolmap.match_exhaustive(
-        database,
-        matching_options=options(pycolmap.FeatureMatchingOptions(), "matching"),
-        verification_options=options(pycolmap.TwoViewGeometryOptions(), "verification"),
-        device=pycolmap.Device.cpu,
+def read_placed(folder: Path) -> Placed:
+    """The cameras of the largest of COLMAP's models, or none."""
+    cameras = [read_cameras(model_files(model).values())[0] for model in model_folders(folder)]
+    best = max(cameras, key=len, default=[])
+    return Placed(
+        {camera.name: camera.cam_from_world for camera in best},
+        {
+            camera.name: camera.lens.mean_focal_length()
+            / max(camera.lens.width, camera.lens.height)
+            for camera in best
+        },
     )
-    models = pycolmap.incremental_mapping(
-        database, folder / "images", folder,
-        options(pycolmap.IncrementalPipelineOptions(), "mapping"),
-    )  # fmt: skip
-    cameras = {}
-    if models:
-        best = max(models.values(), key=lambda model: model.num_reg_images())
-        for image in best.images.values():
-            if image.has_pose:
-                lens = best.cameras[image.camera_id]
-                pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-                cameras[image.name] = (
-                    pose.tolist(),
-                    lens.mean_focal_length() / max(lens.width, lens.height),
-                )
-    (folder / "cameras.json").write_text(json.dumps(cameras))
 
 
 def run_ours(case: Case, threads: int, settings: dict[str, Any], long_side: int) -> dict[str, Any]:
@@ -280,13 +227,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def with_reference(case: Case, kept: dict[str, Placed]) -> Case:
+def with_reference(case: Case, kept: dict[str, Placed], threads: int) -> Case:
     """The case with COLMAP's cameras of all its photographs as truth where it has no other."""
     if case.truth:
         return case
     name = case.name.split("-")[0]
     if name not in kept:
-        kept[name] = run_colmap(case.reference, "colmap")[0]
+        kept[name] = run_colmap(case.reference, "colmap", threads)[0]
     found = kept[name]
     # Sizes don't enter: only poses and relative focal lengths are compared.
     truth = {file: Truth(found.poses[file], found.focals[file], (1, 1)) for file in found.poses}
@@ -302,11 +249,7 @@ def main() -> None:
     parser.add_argument("--long-side", type=int, default=512)
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="of init")
     parser.add_argument("--out", type=Path, help="folder for the figures, added to by later runs")
-    parser.add_argument("--colmap", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.colmap:
-        colmap_here(options.colmap[0], Path(options.colmap[1]))
-        return
     if options.data is None:
         print("benchmarks/init.py: nothing to do without --data FOLDER")
         return
@@ -327,12 +270,12 @@ def main() -> None:
     if "ours" in options.methods and chosen:
         run_ours(chosen[0], options.threads, settings, 256)  # compiles and imports
     for plain in chosen:
-        case = with_reference(plain, reference)
+        case = with_reference(plain, reference, options.threads)
         for method in options.methods:
             if method == "ours":
                 row = run_ours(case, options.threads, settings, options.long_side)
             else:
-                found, *seconds = run_colmap(case.files, method)
+                found, *seconds = run_colmap(case.files, method, options.threads)
                 row = {**score_cameras(case, found), "init": seconds}
             row = {"case": case.name, "method": method, **row}
             rows = [old for old in rows if (old["case"], old["method"]) != (case.name, method)]

@@ -12,6 +12,7 @@ from pipeline.errors import RequestError, nearest
 #: kind -> where its class lives. Imported on first use, so that listing the kinds costs nothing.
 KINDS: dict[str, str] = {
     "views": "pipeline.artifacts.views:Views",
+    "held_out": "pipeline.artifacts.views:HeldOut",
     "pointmaps": "pipeline.artifacts.pointmaps:Pointmaps",
     "cameras": "pipeline.artifacts.cameras:Cameras",
     "points": "pipeline.artifacts.points:Points",

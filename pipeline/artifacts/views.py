@@ -139,6 +139,16 @@ class Views(Artifact):
         return cls(views=tuple(views), ordered=meta["ordered"])
 
 
+@dataclass(frozen=True)
+class HeldOut(Views):
+    """Photographs kept back to test with (`views.held_out`): prepared as the views, but no view.
+
+    Their names begin with h: no view of the case has the name of one.
+    """
+
+    kind: ClassVar[str] = "held_out"
+
+
 def write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
     """Write a grey [H, W] or RGB [H, W, 3] uint8 image without any metadata."""
     ok, data = cv2.imencode(".png", pixels if pixels.ndim == 2 else pixels[..., ::-1])

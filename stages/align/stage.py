@@ -118,7 +118,7 @@ class AlignStage(Stage):
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")
-    optional = ("cameras",)
+    optional = ("cameras", "points")  # points: kept where there are no pointmaps to fuse
     provides = ("cameras", "points")
     libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
 
@@ -140,6 +140,8 @@ class AlignStage(Stage):
             for pair in context.load("pointmaps")
             if pair.name_i in by_name and pair.name_j in by_name
         ]
+        if not pairs and len(context.load("pointmaps")) == 0 and _kept(context):
+            return
         if not pairs:
             raise ReconstructionError(
                 "There are no pointmaps of these photographs: no two of them could be matched. "
@@ -218,6 +220,19 @@ class AlignStage(Stage):
             points=len(cloud), fill_points=cloud.fill, views=len(placed),
             views_total=len(views), **figures,
         )  # fmt: skip
+
+
+def _kept(context: StageContext) -> bool:
+    """Pass on cameras and points as they are, where they came without pointmaps."""
+    if not (context.has("cameras") and context.has("points")):
+        return False
+    cameras, points = context.load("cameras"), context.load("points")
+    if len(cameras) < 2 or len(points) == 0:
+        return False
+    context.save(cameras)
+    context.save(points)
+    context.summarize(points=len(points), views=len(cameras), kept="as given, without pointmaps")
+    return True
 
 
 def _optimised(context, views, pairs, start):  # type: ignore[no-untyped-def]

@@ -1,136 +1,78 @@
-"""The `evaluate` stage: how close the scene, rendered from each input view, comes to the photo."""
+"""The `evaluate` stage: how good the scene is, by photographs, true cameras and true surfaces."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-from pydantic import Field
-
-from pipeline.artifacts.cameras import Cameras
-from pipeline.artifacts.gaussians import Gaussians
-from pipeline.artifacts.metrics import Metrics
-from pipeline.artifacts.views import Views, to_uint8, write_png
 from pipeline.errors import RequestError
-from pipeline.stage import Stage, StageConfig, StageContext
+from pipeline.stage import Stage, StageContext
+from stages.evaluate.config import EvaluateConfig
 
-Channel = Annotated[float, Field(ge=0, le=1)]
-
-#: The input views trained the scene, so that their figures say nothing about unseen views.
-PROTOCOL = "input views (training views), 8-bit images, registered cameras"
-
-
-class EvaluateConfig(StageConfig):
-    """Settings of the evaluate stage."""
-
-    background: tuple[Channel, Channel, Channel] = Field(
-        (0.0, 0.0, 0.0), description="Colour behind the scene, RGB in 0..1."
-    )
-    comparisons: bool = Field(
-        True, description="Write comparison_<view>.png: photograph | render | error."
-    )
-    max_comparisons: int = Field(
-        24, ge=1, le=1000, description="At most so many comparison pictures, spread over the views."
-    )
-    error_range: float = Field(
-        0.25, gt=0, le=1, description="Error (0..1) that has the brightest colour in the pictures."
-    )
-    save_renders: bool = Field(False, description="Also write render_<view>.png of every view.")
+#: Suffixes of masks.
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 class EvaluateStage(Stage):
-    """Views, cameras and Gaussians -> metrics of the input views."""
+    """Views, cameras and Gaussians -> metrics; more of them where the truth is known."""
 
     name = "evaluate"
-    version = 2
-    summary = "PSNR and SSIM of the renders against the input photographs, side by side pictures"
+    version = 3
+    summary = "figures of input and held-out views, poses and geometry; side by side pictures"
     Config = EvaluateConfig
     requires = ("views", "cameras", "gaussians")
+    optional = ("held_out", "points")
     provides = ("metrics",)
-    libraries = ("numpy", "numba", "opencv-contrib-python-headless")
+    libraries = (
+        "numpy", "numba", "opencv-contrib-python-headless", "scipy", "open3d", "pycolmap",
+        "flip-evaluator", "torchmetrics", "torch",
+    )  # fmt: skip
+
+    def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
+        from stages.evaluate.perceptual import find_vgg_weights
+        from stages.geometry.known_cameras import model_files
+
+        found: dict[str, Path] = {}
+        if config.ground_truth is not None:
+            files = model_files(Path(config.ground_truth), "evaluate.ground_truth")
+            found |= {f"ground_truth/{path.name}": path for path in files.values()}
+        if config.mesh is not None:
+            found["mesh/mesh.ply"] = _mesh_file(config)
+        if config.masks is not None:
+            found |= {f"masks/{path.name}": path for path in _mask_files(config.masks)}
+        weights = find_vgg_weights(config.lpips_weights)
+        if weights is not None:
+            found[f"lpips/vgg16{weights.suffix}"] = weights
+        return found
 
     def run(self, context: StageContext) -> None:
+        from stages.evaluate.evaluation import evaluate
         from stages.splatting import render
 
         evaluate(context, render)
 
 
-def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
-    """Render every placed view, compare, write figures and pictures.
-
-    Args:
-        context: of the stage.
-        render: (gaussians, camera, background, threads) -> object with `image` [H, W, 3] and
-            `alpha` [H, W].
-
-    Raises:
-        RequestError: no camera belongs to any of the views.
-    """
-    from stages.evaluate import pictures
-    from stages.evaluate.score import score_view, summary_of
-
-    config: EvaluateConfig = context.config
-    views: Views = context.load("views")
-    placed_cameras: Cameras = context.load("cameras")
-    cameras = placed_cameras.by_name()
-    gaussians: Gaussians = context.load("gaussians")
-    placed = [view for view in views.views if view.name in cameras]
-    unplaced = [view.name for view in views.views if view.name not in cameras]
-    if not placed:
+def _mesh_file(config: Any) -> Path:
+    path = Path(config.mesh).expanduser()
+    if not path.is_file():
+        raise RequestError(f"evaluate.mesh: there is no file {path}. Give a mesh as .ply.")
+    if config.ground_truth is None:
         raise RequestError(
-            "None of the cameras belongs to one of the views, so there is nothing to compare: the "
-            f"views are {', '.join(unplaced)}, the cameras {', '.join(sorted(cameras)) or 'none'}. "
-            "Cameras from outside must carry the names of the views."
+            "evaluate.mesh is given, but not evaluate.ground_truth: without true cameras nobody "
+            "knows where the reconstruction lies in the world of the mesh. Give both, or neither."
         )
-    folder = context.output("metrics")
-    pictured = set(pictures.spread(len(placed), config.max_comparisons))
-    figures: dict[str, dict[str, float]] = {}
-    without_pixels: list[str] = []
-    for index, view in enumerate(placed):
-        context.progress("render", index, len(placed), view=view.name)
-        valid = view.valid()
-        if not valid.any():
-            without_pixels.append(view.name)
-            continue
-        camera = cameras[view.name].resized(view.width, view.height)
-        result = render(
-            gaussians, camera, background=config.background, threads=context.threads
-        )  # fmt: skip
-        rendered, photo = to_uint8(np.asarray(result.image)), to_uint8(view.image)
-        figures[view.name] = score_view(rendered, photo, np.asarray(result.alpha), valid)
-        if config.comparisons and index in pictured:
-            picture = pictures.comparison(rendered, photo, config.error_range, view.mask)
-            write_png(folder / f"comparison_{view.name}.png", picture)
-        if config.save_renders:
-            write_png(folder / f"render_{view.name}.png", rendered)
-    context.progress("render", len(placed), len(placed))
-    if not figures:
+    return path
+
+
+def _mask_files(folder: str) -> list[Path]:
+    path = Path(folder).expanduser()
+    if not path.is_dir():
         raise RequestError(
-            "The masks leave no pixel of any placed view, so there is nothing to compare. Check "
-            "that white means 'use this pixel' in your masks."
+            f"evaluate.masks: there is no folder {path}. Give the folder of masks named as the "
+            "photographs, 255 where the figures count."
         )
-    if without_pixels:
-        context.warn(f"Not scored, because their masks are empty: {', '.join(without_pixels)}.")
-    summary = summary_of(figures)
-    context.save(
-        Metrics(
-            {
-                "protocol": PROTOCOL,
-                "background": list(config.background),
-                "gaussians": len(gaussians),
-                "views": figures,
-                **summary,
-                "coverage": summary["mean"]["coverage"],
-                "views_unplaced": unplaced,
-                "views_without_pixels": without_pixels,
-            }
-        )
-    )
-    mean = summary["mean"]
-    context.summarize(
-        psnr=round(mean["psnr"], 2),
-        ssim=round(mean["ssim"], 4),
-        coverage=round(mean["coverage"], 4),
-        views=f"{len(figures)}/{len(views)}",
-    )
+    found = sorted(file for file in path.iterdir() if file.suffix.lower() in _PICTURES)
+    if not found:
+        raise RequestError(f"evaluate.masks: there is no picture in {path}.")
+    return found

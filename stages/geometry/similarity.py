@@ -49,6 +49,50 @@ def robust_similarity(
     return scale, rotation, shift
 
 
+def camera_similarity(source: Array, target: Array, lever: float) -> tuple[float, Array, Array]:
+    """Least-squares similarity between the worlds of cameras, by their centres and orientations.
+
+    Centres alone leave the rotation open where they lie near a line, and fit any error away where
+    they are few. So each camera's axes count too, as if points at a distance of `lever` along them
+    had been seen: at the scene's distance, an error of the orientation and of the centre that move
+    the picture alike weigh alike. The scale is of the centres alone.
+
+    Args:
+        source, target: [N, 4, 4] cam_from_world of the same cameras in two worlds; N >= 2.
+        lever: distance in the source world, about that from cameras to scene.
+
+    Returns:
+        Scale, rotation [3, 3], translation [3] of target ~ s R source + t.
+
+    Raises:
+        ValueError: fewer than two cameras, or all at one place.
+    """
+    centres_a, centres_b = (
+        -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (source, target)
+    )
+    mean_a, mean_b = centres_a.mean(0), centres_b.mean(0)
+    a, b = centres_a - mean_a, centres_b - mean_b
+    spread_a, spread_b = float(np.sqrt((a**2).sum())), float(np.sqrt((b**2).sum()))
+    if len(a) < 2 or spread_a <= 1e-12 * lever or spread_b == 0:
+        raise ValueError("the cameras of a similarity must be at two places at least")
+    turns = np.einsum("nji,njk->ik", target[:, :3, :3], source[:, :3, :3])
+    u, _, vt = np.linalg.svd(b.T @ a * (spread_a / spread_b) + lever**2 * turns)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    scale = float((b * (a @ rotation.T)).sum()) / spread_a**2
+    if scale <= 0:  # the orientations say the opposite of the centres
+        scale = spread_b / spread_a
+    return scale, rotation, mean_b - scale * rotation @ mean_a
+
+
+def moved_camera(cam_from_world: Array, scale: float, rotation: Array, shift: Array) -> Array:
+    """[4, 4] cam_from_world of the same camera after its world is moved: x -> s R x + t."""
+    turned = cam_from_world[:3, :3] @ rotation.T
+    pose = np.eye(4)
+    pose[:3, :3] = turned
+    pose[:3, 3] = scale * cam_from_world[:3, 3] - turned @ shift
+    return pose
+
+
 def pixel_grid(height: int, width: int) -> Array:
     """[H, W, 2] pixel centres (u, v)."""
     v, u = np.mgrid[:height, :width] + 0.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -52,6 +52,7 @@ class Evidence:
         linked: the pairs that can be believed.
         flat: least share of the inliers of a pair that one homography explains, of the pairs used
             that move most; 1: there is no depth to see.
+        correspondences: the matches themselves, that `edges` tell the inliers of.
     """
 
     keypoints: list[int]
@@ -60,6 +61,7 @@ class Evidence:
     edges: dict[Pair, TwoView] = field(default_factory=dict)
     linked: tuple[Pair, ...] = ()
     flat: float = 0.0
+    correspondences: Mapping[Pair, Correspondences] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,7 @@ def reconstruct(
             edges=edges,
             linked=tuple(solver.believed(edges)),
             flat=min(shares, default=0.0),
+            correspondences=correspondences,
         ),
         focal_known=known,
         focal_determined=determined,

@@ -25,9 +25,11 @@ POINTMAPS = PointmapOptions()
 class DenseConfig(StageConfig):
     """Dense stereo."""
 
-    method: Literal["sweep", "sgbm"] = Field(
-        "sweep",
-        description="plane sweep with semi-global matching; sgbm: a quick preview for near views",
+    method: Literal["auto", "sweep", "sgbm"] = Field(
+        "auto",
+        description="sweep: plane sweep with semi-global matching; sgbm: a quick preview for near "
+        "views; auto: sweep, or the surface of the teeth where init.cameras are given and few wide "
+        "photographs show teeth",
     )
     planes: int = Field(
         DENSE.planes, ge=8, le=512, description="least number of depths tried per pixel"
@@ -208,18 +210,26 @@ class DentalConfig(StageConfig):
     accept_doubtful: bool = Field(
         False, description="go on with a doubtful result; the doubts become warnings"
     )
-    gum_height: float = Field(
-        SURFACE.gum_height, ge=0, le=20, description="gum shown beyond the crowns, mm"
-    )
+    gum_height: float | None = Field(
+        None, ge=0, le=40,
+        description="gum shown beyond the crowns, mm; null: 4, or 20 where init.cameras are given",
+    )  # fmt: skip
     cloud_spacing: float = Field(
         SURFACE.cloud_spacing, ge=0.03, le=2, description="distance of the points, mm"
     )
     chart_density: float = Field(
         SURFACE.chart_density, ge=4, le=30, description="samples per mm of the dense surface"
     )
-    mask_rest: bool = Field(
-        True, description="mask what is not teeth or gum: gloves, lips, retractors"
+    mask_rest: bool | None = Field(
+        None,
+        description="mask what is not teeth or gum: gloves, lips, retractors; null: unless "
+        "init.cameras are given",
     )
+    wide_angle: float = Field(
+        30.0, ge=0, le=180,
+        description="init.cameras given: where neighbouring views (3 to 12, of teeth) are further "
+        "apart than this, degrees, the teeth's own surface is made instead of the sweep's",
+    )  # fmt: skip
 
     @field_validator("order", mode="before")
     @classmethod
@@ -249,6 +259,11 @@ class InitConfig(StageConfig):
         None,
         description="cameras that are known: folder of a COLMAP model, or a transforms.json; the "
         "poses and lenses are taken as they are",
+    )
+    points: Literal["dense", "model"] = Field(
+        "dense",
+        description="first points: dense stereo; or, with the cameras of a COLMAP model, the "
+        "sparse points of that model as they are (align then keeps them)",
     )
     units: Literal["auto", "mm", "arbitrary"] = Field(
         "auto", description="units of the known cameras; auto: as their file says"
@@ -304,6 +319,9 @@ class InitConfig(StageConfig):
     )
     min_dense_points: int = Field(
         5000, ge=0, description="with fewer dense points the sparse ones are added"
+    )
+    match_pictures: int = Field(
+        12, ge=0, le=1000, description="pairs of photographs drawn with their matches; 0: none"
     )
     pointmap: PointmapConfig = Field(
         PointmapConfig.model_validate({}), description="learned models and pointmap files"

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from stages.init.colmap import quiet_pycolmap
+from stages.geometry.colmap import quiet_pycolmap
 
 
 @dataclass(frozen=True)

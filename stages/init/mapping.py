@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.colmap import quiet_pycolmap
+from stages.geometry.colmap import quiet_pycolmap
 from stages.init.geometry import Correspondences, Lens, Pair, TwoView
 from stages.init.mappers import MapperOptions, global_models, incremental_models
 from stages.init.undistort import undistort_pixels

@@ -12,10 +12,11 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from stages.geometry.known_cameras import KnownCamera, as_pinhole, rounded
 from stages.init.classical import Attempt, find_features, match_views, reconstruct
 from stages.init.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
 from stages.init.geometry import Correspondences, Pair
-from stages.init.known import KnownCamera, as_pinhole, rounded
+from stages.init.match_pictures import Links, match_pictures
 from stages.init.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
 from stages.init.placement import Placement
 from stages.init.triangulate import agreeing_matches, link_tracks, triangulate
@@ -41,7 +42,7 @@ def photo_name(view: View) -> str:
 def place_classical(
     views: list[View], focals: list[float | None], focal_given: bool, ordered: bool,
     least_views: int, options: ClassicalOptions, refinement: RefinementOptions, *, seed: int,
-    threads: int, scratch: Path, progress: Progress, warn: Warn,
+    threads: int, scratch: Path, progress: Progress, warn: Warn, pictures: int = 0,
 ) -> Placement:  # fmt: skip
     """Cameras from features and COLMAP's mappers (`stages.init.classical`).
 
@@ -50,6 +51,7 @@ def place_classical(
         focal_given: the user said them; they are not refined.
         ordered: the views are a sequence.
         least_views: with fewer placed it is a failure.
+        pictures: at most so many pairs are drawn for the message of a failure.
 
     Raises:
         ReconstructionError: the photographs don't allow it; the message is the diagnosis.
@@ -64,10 +66,24 @@ def place_classical(
     limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)
     diagnosis = failure(attempt, names, limits)
     if diagnosis:
-        raise ReconstructionError(diagnosis)
+        # All pairs that have any geometry: what is missing shows in the weak ones.
+        links = replace(links_of(views, attempt), used=frozenset())
+        drawn = match_pictures(links, pictures)
+        raise ReconstructionError(diagnosis, drawn)
     for text in warnings_of(attempt, names):
         warn(text)
     return _from_attempt(views, attempt)
+
+
+def links_of(views: list[View], attempt: Attempt) -> Links:
+    """What links the photographs of an attempt, also of one that failed."""
+    evidence, solution = attempt.evidence, attempt.solution
+    return Links(
+        views=tuple(views), matches=evidence.correspondences,
+        verified={pair: edge.inliers for pair, edge in evidence.edges.items()},
+        weights={pair: edge.evidence for pair, edge in evidence.edges.items()},
+        used=frozenset(solution.edges if solution else ()),
+    )  # fmt: skip
 
 
 def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
@@ -99,6 +115,7 @@ def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
             "reprojection_error_px": round(solution.error, 3),
             "matches": sum(len(edge.inliers) for edge in attempt.evidence.edges.values()),
         },
+        links=links_of(views, attempt),
     )  # fmt: skip
 
 
@@ -175,6 +192,11 @@ def place_known(
             "reprojection_error_px": round(float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), 3),
             "matches": sum(len(those) for those in chosen.values()),
         },
+        links=Links(
+            tuple(placed), matches, chosen,
+            {pair: float(len(those)) for pair, those in chosen.items()},
+            frozenset(pair for pair, those in chosen.items() if len(those)),
+        ),
     )  # fmt: skip
 
 

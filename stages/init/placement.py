@@ -11,6 +11,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from stages.geometry.world import move_camera, normalising_similarity
 from stages.init.geometry import Pair
+from stages.init.match_pictures import Links
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +29,7 @@ class Placement:
         input_from_world: [4, 4] similarity to the frame of known input; identity: nothing known.
         units: ``"mm"`` or ``"arbitrary"``, of that frame.
         figures: for the summary.
+        links: the matches that the cameras came from, to be drawn; None without.
     """
 
     views: tuple[View, ...]
@@ -38,6 +40,7 @@ class Placement:
     input_from_world: Array = field(default_factory=lambda: np.eye(4))
     units: str = "arbitrary"
     figures: dict[str, float | int | str] = field(default_factory=dict)
+    links: Links | None = None
 
     def normalised(self) -> Placement:
         """The same in a world that is centred, scaled and upright (`normalising_similarity`).

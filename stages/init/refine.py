@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.init.colmap import quiet_pycolmap
+from stages.geometry.colmap import quiet_pycolmap
 from stages.init.mapping import Distortions, MappingInput, Solution, lens_cameras, solution_of
 from stages.init.options import RefinementOptions
 from stages.init.solver import EXIF_TOLERANCE, Solver

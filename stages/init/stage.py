@@ -15,6 +15,7 @@ from stages.init.config import InitConfig
 
 if TYPE_CHECKING:
     from pipeline.checkup import Finding
+    from stages.geometry.known_cameras import KnownCamera
     from stages.init.options import ClassicalOptions
     from stages.init.pointmap.options import PointmapOptions
 
@@ -27,17 +28,18 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 2
+    version = 3
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
     provides = ("cameras", "points", "pointmaps")
-    may_provide = ("views", "pictures")  # undistorted; labelled teeth
+    may_provide = ("views", "pictures")  # undistorted; matches or labelled teeth
     libraries = ("pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
     methods = {  # noqa: RUF012
         "auto": "known where init.cameras is given; a model where init.pointmap.checkpoint is "
         "given and one is installed; else colmap, and dental if that fails and teeth are found",
-        "known": "cameras from a COLMAP model or transforms.json (init.cameras); dense stereo",
+        "known": "cameras from a COLMAP model or transforms.json (init.cameras); dense stereo, or "
+        "the surface of the teeth where few wide photographs show some",
         "colmap": "yaw-compensated SIFT, COLMAP's mappers, plane-sweep stereo; no network needed",
         "dental": "wide photographs of teeth: the teeth are the landmarks; a dense surface of them",
         "mapanything": "MapAnything, if installed",
@@ -49,15 +51,26 @@ class InitStage(Stage):
     }
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from stages.init.known import model_files
+        from stages.geometry.known_cameras import model_files
 
         if config.cameras is not None:
-            if config.method not in ("auto", "known"):
+            if config.method not in ("auto", "known", "dental"):
                 raise RequestError(
                     f"init.cameras is given, but init.method={config.method} would not use it. "
                     "Leave one of them out."
                 )
-            return model_files(Path(config.cameras))
+            files = model_files(Path(config.cameras))
+            if config.points == "model" and not any("points3D" in label for label in files):
+                raise RequestError(
+                    f"init.points=model: {config.cameras} holds no points. Give the folder of a "
+                    "COLMAP model with points3D.bin or points3D.txt, or leave init.points out."
+                )
+            return files
+        if config.points == "model":
+            raise RequestError(
+                "init.points=model takes the points of a COLMAP model, but none is given. Pass "
+                "--set init.cameras=FOLDER too."
+            )
         if config.method == "known":
             raise RequestError(
                 "init.method is known, but no cameras are given. Pass --set init.cameras=PATH with "
@@ -143,6 +156,7 @@ def _from_features(context: StageContext, views: Views) -> None:
             _classical_options(config), RefinementOptions(**config.refinement.model_dump()),
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=context.warn,
+            pictures=config.match_pictures,
         )  # fmt: skip
     except ReconstructionError as unplaced:
         if config.method != "auto" or not _teeth_are_worth_a_try(views, context.threads):
@@ -172,7 +186,7 @@ def _from_teeth_instead(context: StageContext, views: Views, unplaced: Reconstru
         raise ReconstructionError(
             f"Neither the texture nor the teeth place these photographs safely. By texture: "
             f"{unplaced} By teeth: {doubtful}",
-            doubtful.pictures,
+            doubtful.pictures or unplaced.pictures,
         ) from doubtful
 
 
@@ -185,19 +199,54 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
-    from stages.init.known import matching_cameras, read_cameras
+    from stages.geometry.known_cameras import matching_cameras, read_cameras
     from stages.init.place import place_known
     from stages.init.write import densify
 
     config: InitConfig = context.config
     cameras, units = read_cameras(context.sources.values())
+    known = matching_cameras(cameras, views.views)
+    units = units if config.units == "auto" else config.units
+    if config.points == "model":
+        from stages.init.model_start import from_model
+
+        from_model(context, views, known, units)
+        return
+    if config.method == "dental" or _teeth_are_wide_apart(context, views, known):
+        from stages.init.known_teeth import from_known_teeth
+
+        try:
+            from_known_teeth(context, views, known, units)
+            return
+        except ReconstructionError as doubtful:
+            if config.method == "dental":
+                raise
+            context.warn(
+                "The surface of the teeth could not be made with the cameras given; dense stereo "
+                f"is used instead, which knows less of it. {doubtful}"
+            )
     placement = place_known(
-        list(views.views), matching_cameras(cameras, views.views),
-        units if config.units == "auto" else config.units, views.ordered,
+        list(views.views), known, units, views.ordered,
         _classical_options(config), threads=context.threads, progress=context.progress,
         warn=context.warn,
     )  # fmt: skip
     densify(context, views, placement.normalised())
+
+
+def _teeth_are_wide_apart(
+    context: StageContext, views: Views, known: dict[str, KnownCamera]
+) -> bool:
+    """Few photographs of teeth with known cameras, too far apart for dense stereo."""
+    from stages.geometry.known_cameras import pinhole_camera
+    from stages.init.known_teeth import neighbour_angle
+
+    config: InitConfig = context.config
+    if config.dense.method != "auto":
+        return False
+    posed = tuple(view for view in views.views if view.name in known)
+    angle = neighbour_angle([pinhole_camera(view, known[view.name]) for view in posed])
+    wide = angle > config.dental.wide_angle
+    return wide and _teeth_are_worth_a_try(replace(views, views=posed), context.threads)
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:

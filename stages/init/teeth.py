@@ -56,8 +56,9 @@ def _write(context: StageContext, views: Views, teeth: Teeth) -> None:
     surface = teeth.surface
     order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
     mm, uncertainty = scale_from_widths(teeth.fit, config.dental.tooth_widths)
+    mask = config.dental.mask_rest is not False
     placement = Placement(
-        views=tuple(_masked(views.views[k], teeth, k, config.dental.mask_rest) for k in order),
+        views=tuple(_masked(views.views[k], teeth, k, mask) for k in order),
         cameras=tuple(_camera(views.views[k], teeth, k) for k in order),
         points=surface.positions.astype(np.float64), seen=(), weights={},
         input_from_world=np.diag([mm, mm, mm, 1.0]), units="mm",
@@ -87,13 +88,8 @@ def _write(context: StageContext, views: Views, teeth: Teeth) -> None:
         Cameras(cameras, placement.input_from_world, "mm"), depths, points, pairs,
     )  # fmt: skip
     context.save(Pictures(teeth.pictures))
-    placed = [view for view in teeth.fit.views if view is not None]
-    upper = {tooth for view in placed for tooth in view.upper if tooth}
-    lower = {tooth for view in placed for tooth in view.lower if tooth}
     context.summarize(
-        method="dental", upper_teeth=len(upper), lower_teeth=len(lower),
-        label_margin=round(teeth.fit.margin, 1),
-        landmark_error_px=round(float(np.median([view.error for view in placed])), 2),
+        method="dental", **tooth_counts(teeth),
         scale_uncertainty_percent=round(100 * uncertainty, 1),
     )  # fmt: skip
     if config.length.mm is None and not config.dental.tooth_widths:
@@ -117,7 +113,23 @@ def _masked(view: View, teeth: Teeth, number: int, mask_rest: bool) -> View:
     found = teeth.surface.views[number]
     if not mask_rest or found is None:
         return view
-    return replace(view, mask=(found.depth > 0) & view.valid())
+    return masked(view, found.depth)
+
+
+def masked(view: View, depth: Map) -> View:
+    """The view with what has no depth masked out."""
+    return replace(view, mask=(depth > 0) & view.valid())
+
+
+def tooth_counts(teeth: Teeth) -> dict[str, float]:
+    """Figures of the teeth found, for the summary."""
+    placed = [view for view in teeth.fit.views if view is not None]
+    return {
+        "upper_teeth": len({tooth for view in placed for tooth in view.upper if tooth}),
+        "lower_teeth": len({tooth for view in placed for tooth in view.lower if tooth}),
+        "label_margin": round(teeth.fit.margin, 1),
+        "landmark_error_px": round(float(np.median([view.error for view in placed])), 2),
+    }
 
 
 def neighbours(cameras: tuple[Camera, ...]) -> list[Pair]:
@@ -157,4 +169,5 @@ def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
 def surface_options(config: DentalConfig) -> SurfaceOptions:
     """The settings of the dense surface."""
     shared = set(DentalConfig.model_fields) & set(SurfaceOptions.__dataclass_fields__)
-    return SurfaceOptions(**{name: getattr(config, name) for name in sorted(shared)})
+    settings = {name: getattr(config, name) for name in sorted(shared)}
+    return SurfaceOptions(**{name: value for name, value in settings.items() if value is not None})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
@@ -18,6 +20,7 @@ from stages.init import cloud
 from stages.init.config import InitConfig
 from stages.init.dense import DenseOptions, dense_depths
 from stages.init.geometry import spanning_tree
+from stages.init.match_pictures import Links, match_pictures, match_table
 from stages.init.scale import mm_per_unit, photo_named
 
 if TYPE_CHECKING:
@@ -31,12 +34,14 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
     config: InitConfig = context.config
     cameras, points = placement.cameras, placement.points
     images = [view.image for view in placement.views]
+    settings = config.dense.model_dump()
+    settings["method"] = "sgbm" if config.dense.method == "sgbm" else "sweep"
     dense = dense_depths(
         images,
         [view.valid() for view in placement.views],
         list(cameras),
         [points[seen].astype(np.float32) for seen in placement.seen],
-        DenseOptions(**config.dense.model_dump()),
+        DenseOptions(**settings),
         context.threads,
         lambda done, total: context.progress("dense stereo", done, total),
     )
@@ -72,7 +77,16 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
         context, views, placement.views,
         Cameras(cameras, placement.input_from_world, placement.units), depths, result, pairs,
     )  # fmt: skip
+    if placement.links is not None and config.match_pictures:
+        save_matches(context, placement.links, config.match_pictures)
     context.summarize(sparse_points=len(points), dense_points=dense_count, **placement.figures)
+
+
+def save_matches(context: StageContext, links: Links, most: int) -> None:
+    """Write pictures of at most so many pairs, and `matches.json` with all of them."""
+    context.save(Pictures(match_pictures(links, most)))
+    text = json.dumps(match_table(links), indent=1)
+    (context.output("pictures") / "matches.json").write_text(text + "\n")
 
 
 def save_all(

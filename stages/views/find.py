@@ -144,6 +144,28 @@ def find_masks(folder: Path, labels: Iterable[str]) -> dict[str, Path]:
     return found
 
 
+def held_labels(labels: Iterable[str], held_out: Sequence[str]) -> tuple[str, ...]:
+    """The labels that `held_out` names, by file name or by stem, in their own order.
+
+    Raises:
+        RequestError: a name fits no photograph, or several.
+    """
+    labels = list(labels)
+    found = set()
+    for name in held_out:
+        fitting = [label for label in labels if name in (label, PurePath(label).name)]
+        fitting = fitting or [label for label in labels if PurePath(label).stem == name]
+        if len(fitting) != 1:
+            problem = f"several ({', '.join(fitting[:3])})" if fitting else "none of them"
+            hint = nearest(name, [PurePath(label).stem for label in labels])
+            raise RequestError(
+                f"views.held_out: of the {len(labels)} photographs given, '{name}' names "
+                f"{problem}.{hint} Give file names, with or without suffix."
+            )
+        found.add(fitting[0])
+    return tuple(label for label in labels if label in found)
+
+
 def _expand(item: str | Path) -> list[Path]:
     path = Path(item).expanduser()
     status = _stat(path)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from stages.views.decode import UnusableImage, decode_mask, decode_photo, large_images_allowed
 from stages.views.video import read_frames
@@ -124,6 +125,24 @@ def drop_duplicates(
         else:
             first[key] = item
     return list(first.values())
+
+
+def prepared_views(loaded: Sequence[Loaded], prefix: str = "") -> tuple[View, ...]:
+    """The views of an artifact, numbered in order: ``000``, ``001``, ... after the prefix."""
+    return tuple(
+        View(
+            name=f"{prefix}{number:03d}",
+            image=item.picture.rgb.astype(np.float32) / np.float32(255),
+            mask=item.picture.mask,
+            working_from_source=item.picture.working_from_source,
+            source_size=item.picture.source_size,
+            source_name=item.source_name,
+            source_sha256=item.source_sha256,
+            focal_px=item.picture.focal_px,
+            timestamp=item.timestamp,
+        )
+        for number, item in enumerate(loaded)
+    )
 
 
 def shows_nothing(picture: Prepared) -> bool:

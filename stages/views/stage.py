@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any, ClassVar
 
-import numpy as np
 from pydantic import Field
 
 from pipeline.errors import RequestError
 from pipeline.stage import Stage, StageConfig, StageContext, runtime
-from stages.views.find import MASK_PREFIX, find_images, find_masks, is_video
+from stages.views.find import MASK_PREFIX, find_images, find_masks, held_labels, is_video
 from stages.views.sampling import is_sequence, uniform_indices
 
 FRAMES_OF_A_VIDEO = 24  # as the paper samples (section 4.1)
@@ -37,6 +36,11 @@ class ViewsConfig(StageConfig):
         description="folder of masks named as the photographs, bright where these may be used "
         "(their contents count, not their place)",
     )
+    held_out: tuple[str, ...] = Field(
+        (),
+        description="photographs to test with: file names or stems among those given (of a video: "
+        "film.mp4#12); no stage but evaluate sees them",
+    )
     deduplicate: bool = Field(True, description="leave out photographs that are there twice")
 
 
@@ -48,6 +52,7 @@ class ViewsStage(Stage):
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
+    may_provide: ClassVar[tuple[str, ...]] = ("held_out",)
     libraries: ClassVar[tuple[str, ...]] = (
         "av", "opencv-contrib-python-headless", "pillow", "pillow-heif",
     )  # fmt: skip
@@ -56,16 +61,24 @@ class ViewsStage(Stage):
     def sources(self, config: ViewsConfig, request: Mapping[str, Any]) -> Mapping[str, Path]:
         files = find_images(request["images"])
         masks = find_masks(config.masks, files) if config.masks is not None else {}
-        labels = list(files)
-        chosen = [labels[i] for i in uniform_indices(len(labels), config.frames)]
+        held = () if is_video(PurePath(next(iter(files)))) else held_labels(files, config.held_out)
+        inputs = [label for label in files if label not in held]
+        kept = {inputs[i] for i in uniform_indices(len(inputs), config.frames)} | set(held)
+        chosen = [label for label in files if label in kept]
         named = {
             f"{MASK_PREFIX}{masks[label].name}": masks[label] for label in chosen if label in masks
         }
         return {label: files[label] for label in chosen} | named
 
     def run(self, context: StageContext) -> None:
-        from pipeline.artifacts.views import View, Views
-        from stages.views.load import drop_duplicates, load_photos, load_video, shows_nothing
+        from pipeline.artifacts.views import HeldOut, Views
+        from stages.views.load import (
+            drop_duplicates,
+            load_photos,
+            load_video,
+            prepared_views,
+            shows_nothing,
+        )
 
         config: ViewsConfig = context.config
         files = {k: v for k, v in context.sources.items() if not k.startswith(MASK_PREFIX)}
@@ -78,44 +91,45 @@ class ViewsStage(Stage):
         first = next(iter(files))
         from_video = is_video(PurePath(first))
         if from_video:
-            loaded = load_video(
+            everything = load_video(
                 first, files[first], masks.get(first), config.frames or FRAMES_OF_A_VIDEO,
                 threads=context.threads, progress=progress, **size,
             )  # fmt: skip
         else:
-            loaded = load_photos(files, masks, threads=context.threads, progress=progress, **size)
-        distinct = drop_duplicates(loaded, context.warn) if config.deduplicate else loaded
+            everything = load_photos(
+                files, masks, threads=context.threads, progress=progress, **size
+            )
+        held_names = held_labels([item.source_name for item in everything], config.held_out)
+        loaded = [item for item in everything if item.source_name not in held_names]
+        # the views come first: what is held out never decides which of them stays
+        distinct, held = loaded, [item for item in everything if item.source_name in held_names]
+        if config.deduplicate:
+            unlike = drop_duplicates([*loaded, *held], context.warn)
+            distinct = [item for item in unlike if item.source_name not in held_names]
+            held = [item for item in unlike if item.source_name in held_names]
         if len(distinct) < 2:
             what = "one frame only" if from_video else "the same picture"
             named = first if from_video else " and ".join(item.source_name for item in loaded[:3])
+            if len(loaded) < 2 and held_names:
+                what, named = "too much is held out", "views.held_out"
             raise RequestError(
                 f"{named}: {what}, and a 3D scene needs at least two different photographs, better "
                 "three or more, taken from different sides. Add some and run again."
             )
-        if config.frames is not None and len(loaded) < config.frames:
+        if config.frames is not None and len(everything if from_video else loaded) < config.frames:
             context.warn(
                 f"{config.frames} views were asked for, but there are only {len(loaded)}: all of "
                 "them are used."
             )
-        for item in distinct:
+        for item in (*distinct, *held):
             if shows_nothing(item.picture):
                 context.warn(f"{item.source_name} shows almost nothing (a blank or black picture).")
-        views = tuple(
-            View(
-                name=f"{number:03d}",
-                image=item.picture.rgb.astype(np.float32) / np.float32(255),
-                mask=item.picture.mask,
-                working_from_source=item.picture.working_from_source,
-                source_size=item.picture.source_size,
-                source_name=item.source_name,
-                source_sha256=item.source_sha256,
-                focal_px=item.picture.focal_px,
-                timestamp=item.timestamp,
-            )
-            for number, item in enumerate(distinct)
-        )
+        views = prepared_views(distinct)
         ordered = from_video or is_sequence([item.source_name for item in distinct])
         context.save(Views(views, ordered=ordered))
+        if held:
+            context.save(HeldOut(prepared_views(held, "h"), ordered=ordered))
+            context.summarize(held_out=len(held))
         context.summarize(
             views=len(views),
             width=max(view.width for view in views),

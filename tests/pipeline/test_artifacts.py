@@ -16,7 +16,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
-from pipeline.artifacts.views import View, Views
+from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
 
 
@@ -47,6 +47,7 @@ def samples() -> dict[str, Artifact]:
             ),
             ordered=True,
         ),
+        "held_out": HeldOut((View("h000", pixels(5, 7, 3), source_name="b.jpg"),)),
         "pointmaps": Pointmaps(
             [
                 PointmapPair(

@@ -15,14 +15,17 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import View, Views, read_png, to_uint8
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext, get_stage
+from stages.evaluate.config import EvaluateConfig
+from stages.evaluate.evaluation import evaluate
 from stages.evaluate.metrics import psnr, ssim
-from stages.evaluate.stage import EvaluateConfig, EvaluateStage, evaluate
+from stages.evaluate.stage import EvaluateStage
 
 
 @dataclass
 class Rendered:
     image: np.ndarray
     alpha: np.ndarray
+    depth: np.ndarray
 
 
 def view(name: str, height: int, width: int, seed: int) -> View:
@@ -55,7 +58,7 @@ class Darker:
         assert image.shape[:2] == (camera.height, camera.width)
         alpha = np.zeros(image.shape[:2], np.float32)
         alpha[:, : camera.width // 2] = 1
-        return Rendered(image - np.float32(self.by), alpha)
+        return Rendered(image - np.float32(self.by), alpha, 2 * alpha)
 
 
 def context(folder: Path, views: Views, names: list[str], **config: Any) -> LocalContext:

@@ -12,14 +12,14 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
-from stages.init.geometry import Correspondences
-from stages.init.known import (
+from stages.geometry.known_cameras import (
     KnownCamera,
     as_pinhole,
     matching_cameras,
     model_files,
     read_cameras,
 )
+from stages.init.geometry import Correspondences
 from stages.init.scale import mm_per_unit, working_pixel
 from stages.init.stage import InitConfig, InitStage
 from stages.init.triangulate import (

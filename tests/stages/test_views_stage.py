@@ -266,3 +266,49 @@ def test_naming_the_stage_loads_no_heavy_library() -> None:
     code = "import sys, stages.views.stage; print(sorted({'cv2', 'PIL', 'av'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_held_out_photographs_leave_the_views_as_they_were(tmp_path: Path) -> None:
+    """The views are, byte for byte, what they are where the held-out files are not there at all."""
+    for n in range(6):
+        write(tmp_path / "all" / f"p{n}.png", picture(n))
+        if n not in (1, 4):
+            write(tmp_path / "few" / f"p{n}.png", picture(n))
+    held = ["p4", "p1.png"]
+    views, context, _ = run_stage(tmp_path / "a", [tmp_path / "all"], held_out=held)
+    run_stage(tmp_path / "b", [tmp_path / "few"])
+    assert artifact_bytes(tmp_path / "a" / "views") == artifact_bytes(tmp_path / "b" / "views")
+    assert not (tmp_path / "b" / "held_out").exists()
+    out = context.result("held_out")
+    assert [(v.name, v.source_name) for v in out.views] == [("h000", "p1.png"), ("h001", "p4.png")]
+    everything, _, _ = run_stage(tmp_path / "c", [tmp_path / "all"])
+    np.testing.assert_array_equal(out.views[1].image, everything.views[4].image)
+    assert context.figures["held_out"] == 2
+    assert len(views) == 4
+
+
+def test_frames_are_chosen_among_those_that_are_not_held_out(tmp_path: Path) -> None:
+    for n in range(9):
+        write(tmp_path / "in" / f"{n}.png", picture(n))
+    config = ViewsConfig(frames=3, held_out=("3", "5"))
+    labels = list(ViewsStage().sources(config, {"images": [tmp_path / "in"]}))
+    assert labels == ["0.png", "3.png", "4.png", "5.png", "8.png"]
+
+
+def test_a_photograph_like_a_held_out_one_stays(tmp_path: Path) -> None:
+    for n in (0, 1, 2):
+        write(tmp_path / "in" / f"{n}.png", picture(n))
+    write(tmp_path / "in" / "copy.png", picture(2))
+    views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"], held_out=["0", "copy"])
+    assert [view.source_name for view in views.views] == ["1.png", "2.png"]
+    assert [view.source_name for view in context.result("held_out").views] == ["0.png"]
+    assert "copy.png is the same picture as 2.png" in context.warnings[0]
+
+
+def test_wrong_names_of_held_out_photographs(tmp_path: Path) -> None:
+    for n in (0, 1, 2):
+        write(tmp_path / "in" / f"p{n}.png", picture(n))
+    with pytest.raises(RequestError, match=r"'p3' names none of them"):
+        run_stage(tmp_path / "out", [tmp_path / "in"], held_out=["p3"])
+    with pytest.raises(RequestError, match="too much is held out"):
+        run_stage(tmp_path / "out", [tmp_path / "in"], held_out=["p0", "p1"])

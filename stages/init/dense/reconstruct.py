@@ -79,6 +79,33 @@ def dense_depths(
         numba.set_num_threads(before)
 
 
+def complete_depths(
+    images: list[Array],
+    valid: list[Mask],
+    cameras: list[Camera],
+    depths: list[Array],
+    confidences: list[Array],
+    options: DenseOptions,
+    threads: int,
+) -> list[DenseView]:
+    """Depth that is known otherwise, completed as that of stereo, with normals.
+
+    Args:
+        images, valid, cameras, options, threads: as for `dense_depths`.
+        depths: V arrays [H, W] float32 z-depth, 0 where unknown.
+        confidences: V arrays [H, W] float32 >= 1 of it.
+    """
+    before = numba.get_num_threads()
+    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    numba.set_num_threads(max(1, min(threads, available)))
+    try:
+        agreeing = [np.zeros(depth.shape, np.int32) for depth in depths]
+        grays = [to_gray(image) for image in images]
+        return _finish(depths, confidences, agreeing, grays, valid, cameras, options)
+    finally:
+        numba.set_num_threads(before)
+
+
 def _dense_depths(
     images: list[Array],
     valid: list[Mask],
@@ -115,7 +142,7 @@ def _dense_depths(
             depths, scores, agreeing, angles, shiny, strict=True
         )
     ]
-    return _finish(depths, confidences, agreeing, grays, valid, cameras, everything, options)
+    return _finish(depths, confidences, agreeing, grays, valid, cameras, options)
 
 
 def _sweep_view(
@@ -278,7 +305,6 @@ def _finish(
     grays: list[Array],
     valid: list[Mask],
     cameras: list[Camera],
-    everything: npt.NDArray[np.float64],
     options: DenseOptions,
 ) -> list[DenseView]:
     """Complete every view and add normals."""

@@ -18,6 +18,7 @@ from pipeline.errors import RequestError
 from stages.init.dental.anatomy import Landmark, is_upper
 from stages.init.dental.arch_options import ArchOptions, ToothHint
 from stages.init.dental.bundle import view_angles
+from stages.init.dental.bundle_held import held_cameras, roll_matrix
 from stages.init.dental.confidence import crown_doubts, fit_doubts, landmark_errors
 from stages.init.dental.edits import MIN_GAIN, Fixed, improve, margins, solve_shifted
 from stages.init.dental.hypotheses import (
@@ -49,6 +50,8 @@ EDITED, EDIT_WINDOW = 6, 60.0
 SHIFTS, EDIT_GAP = 3, 30.0
 #: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
 MATCHED_YAW = 32.0
+#: How far away known cameras are, they say themselves: hardly any prior (relative deviation).
+HELD_DISTANCE_DEVIATION = 0.5
 #: The millimetres rest on the focal length or distance expected: relative standard deviation.
 SCALE_UNCERTAINTY = 0.15
 
@@ -63,6 +66,7 @@ def fit_arch(
     threads: int,
     progress: Progress,
     names: list[str] | None = None,
+    cameras: list[Array] | None = None,
 ) -> ArchFit:
     """Name the teeth and place the cameras of a few photographs of one patient's closed bite.
 
@@ -76,6 +80,8 @@ def fit_arch(
         threads: threads to use; the result does not depend on them.
         progress: told (step, done, total).
         names: how the user knows the photographs; None: "photo 0", "photo 1", ...
+        cameras: [4, 4] known cam_from_world of each, in any unit, if they are known (their focals
+            too): they are held, and the arch is fitted in front of them.
 
     Returns:
         The fit, in the arch frame (see `PlacedView`). A photograph that can't be placed is None
@@ -87,6 +93,8 @@ def fit_arch(
     """
     del seed
     _check(dentitions, images, valid, focals, options)
+    if cameras is not None:
+        options = replace(options, distance_deviation=HELD_DISTANCE_DEVIATION)
     names = names or [f"photo {index}" for index in range(len(dentitions))]
     doubts: list[str] = []
     placeable = []
@@ -112,12 +120,14 @@ def fit_arch(
     rows = [seen_rows(dentition) for dentition in read]
     shown = [names[i] for i in placeable]
 
-    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads)
+    rolls = [dentition.roll for dentition in read]
+    held = None if cameras is None else held_cameras([cameras[i] for i in placeable], rolls)
+    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held)
     best, others = _label(scorer, fixed, progress)
     if inner.order is not None:
         best, others, scorer, contradiction = _keep_order(
-            Scorer(rows, focal, deviation, inner, threads), fixed, scorer, best, others, shown,
-            progress,
+            Scorer(rows, focal, deviation, inner, threads, held), fixed, scorer, best, others,
+            shown, progress,
         )  # fmt: skip
         doubts += contradiction
     elif len(placeable) == 3:
@@ -312,8 +322,10 @@ def _refine(
         for image, use, dentition in zip(images, valid, dentitions, strict=True)
     ]
     pairs: dict[tuple[int, int], PairFigures] = {}
-    for done in range(options.dense_rounds):
-        progress("dense matches on the arch", done, options.dense_rounds)
+    # With cameras that are known, matches can only speak for or against them.
+    rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds
+    for done in range(rounds):
+        progress("dense matches on the arch", done, rounds)
         yaws = view_angles(best.adjusted)[:, 0]
         order = np.argsort(yaws, kind="stable")
         wanted = {(int(a), int(b)) for a, b in pairwise(order)}
@@ -325,9 +337,10 @@ def _refine(
         matches, pairs = dense_matches(
             best.adjusted, photos, sorted(wanted), options.chart_scale, options.dense_weight
         )
-        start = (best.adjusted.unknowns, best.adjusted.offsets)
-        best = scorer.solve(best.labelling, start, matches=matches)
-    progress("dense matches on the arch", options.dense_rounds, options.dense_rounds)
+        if not scorer.held:
+            start = (best.adjusted.unknowns, best.adjusted.offsets)
+            best = scorer.solve(best.labelling, start, matches=matches)
+    progress("dense matches on the arch", rounds, rounds)
     return best, pairs
 
 
@@ -347,8 +360,7 @@ def _outcome(
     errors = landmark_errors(adjusted, sightings)
     views: list[PlacedView | None] = [None] * count
     for view, photo in enumerate(photos):
-        c, s = np.cos(dentitions[view].roll), np.sin(dentitions[view].roll)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = roll_matrix(dentitions[view].roll)
         pose = np.eye(4)
         pose[:3, :3] = turn @ adjusted.rotations[view]
         pose[:3, 3] = turn @ adjusted.translations[view]

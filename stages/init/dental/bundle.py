@@ -20,6 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental import bundle_kernels as kernels
+from stages.init.dental.bundle_held import (
+    PER_SIMILARITY,
+    HeldCameras,
+    minimise_held,
+    nearest_similarity,
+)
 from stages.init.dental.template import is_lower_landmark
 
 Array = npt.NDArray[np.float64]
@@ -103,7 +109,9 @@ class Adjusted:
         translations: [V, 3] mm.
         focals: [V] pixels.
         points: [L, 3] all landmarks, mm.
-        reduced: [7V + 9, 7V + 9] Hessian of `unknowns` after elimination of the landmarks.
+        reduced: [7V + 9, 7V + 9] Hessian of `unknowns` after elimination of the landmarks; with
+            held cameras [16, 16], of the similarity and the arch.
+        held: the cameras were known and held still relative to each other.
     """
 
     unknowns: Array
@@ -115,6 +123,7 @@ class Adjusted:
     focals: Array
     points: Array
     reduced: Array
+    held: bool = False
 
     @property
     def evidence(self) -> float:
@@ -192,6 +201,7 @@ def adjust(
     start: tuple[Array, Array] | None = None,
     max_steps: int = 40,
     tolerance: float = 0.02,
+    held: HeldCameras | None = None,
 ) -> Adjusted:
     """Find cameras, arch and landmarks of largest posterior probability.
 
@@ -204,6 +214,8 @@ def adjust(
         start: unknowns [7V + 9] and offsets [L, 3] to start from; None: from the priors.
         max_steps: Levenberg-Marquardt steps at most.
         tolerance: decrease of the cost at which it stops.
+        held: the cameras, where they are known (two or more; the priors' focals are taken as
+            they are): only the arch moves before them. Matches tell nothing then.
     """
     views = len(priors.yaws)
     nominal = np.stack([nominal_rotation(float(yaw), priors.elevation) for yaw in priors.yaws])
@@ -217,23 +229,37 @@ def adjust(
     seen, compact = np.unique(sightings.landmark, return_inverse=True)
     seen_offsets = np.ascontiguousarray(offsets[seen])
     angles = np.radians(priors.angle_deviations)
-    reduced = np.empty((len(unknowns), len(unknowns)))
-    cost, log_determinant = kernels.minimise(
-        unknowns, seen_offsets, sightings.view, compact.astype(np.int64), sightings.pixels,
-        sightings.deviations, np.ascontiguousarray(template[seen]), is_lower_landmark()[seen],
-        float(landmark_deviation), nominal, angles, float(priors.distance),
-        float(priors.distance_deviation), priors.focals, priors.focal_deviations,
-        matches.pairs, matches.starts, matches.pixels, matches.weights, matches.deviations,
-        max_steps, tolerance, reduced,
+
+    def place() -> tuple[Array, Array, Array]:
+        rotations, centres, focals = np.empty((views, 3, 3)), np.empty((views, 3)), np.empty(views)
+        kernels.place_cameras(
+            unknowns, views, nominal, angles, float(priors.distance), priors.focals,
+            priors.focal_deviations, rotations, centres, focals, np.empty((views, 3, 3)),
+        )  # fmt: skip
+        return rotations, centres, focals
+
+    seen_of = (
+        sightings.view, compact.astype(np.int64), sightings.pixels, sightings.deviations,
+        np.ascontiguousarray(template[seen]), is_lower_landmark()[seen], float(landmark_deviation),
+        nominal, angles, float(priors.distance), float(priors.distance_deviation), priors.focals,
     )  # fmt: skip
+    if held is None:
+        reduced = np.empty((len(unknowns), len(unknowns)))
+        cost, log_determinant = kernels.minimise(
+            unknowns, seen_offsets, *seen_of, priors.focal_deviations,
+            matches.pairs, matches.starts, matches.pixels, matches.weights, matches.deviations,
+            max_steps, tolerance, reduced,
+        )  # fmt: skip
+    else:
+        turns, shifts = held.from_first()
+        reduced = np.empty((PER_SIMILARITY + kernels.PER_ARCH,) * 2)
+        cost, log_determinant = minimise_held(
+            unknowns, seen_offsets, *nearest_similarity(*place()[:2], turns, shifts), turns, shifts,
+            *seen_of, np.zeros(views), max_steps, tolerance, reduced,
+        )  # fmt: skip
     offsets = np.zeros_like(offsets)
     offsets[seen] = seen_offsets
-    rotations, jacobians = np.empty((views, 3, 3)), np.empty((views, 3, 3))
-    centres, focals = np.empty((views, 3)), np.empty(views)
-    kernels.place_cameras(
-        unknowns, views, nominal, angles, float(priors.distance), priors.focals,
-        priors.focal_deviations, rotations, centres, focals, jacobians,
-    )  # fmt: skip
+    rotations, centres, focals = place()
     return Adjusted(
         unknowns=unknowns,
         offsets=offsets,
@@ -244,6 +270,7 @@ def adjust(
         focals=focals,
         points=shaped_points(unknowns, offsets, template, landmark_deviation),
         reduced=reduced,
+        held=held is not None,
     )
 
 

@@ -65,7 +65,7 @@ def place_cameras(  # type: ignore[no-untyped-def]
     error_model="numpy",
     nogil=True,
 )
-def _add_landmarks(  # type: ignore[no-untyped-def]
+def add_landmarks(  # type: ignore[no-untyped-def]
     x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower, offset_deviation,
     rotations, centres, lens, jacobians, angle_deviations, focal_deviations, derive,
     H, b, H_own, b_own, H_cross,
@@ -152,7 +152,7 @@ def _add_landmarks(  # type: ignore[no-untyped-def]
     error_model="numpy",
     nogil=True,
 )
-def _add_matches(  # type: ignore[no-untyped-def]
+def add_matches(  # type: ignore[no-untyped-def]
     pairs, starts, matches, pair_weights, pair_deviations,
     rotations, centres, lens, jacobians, angle_deviations, focal_deviations, derive, H, b,
 ):  # fmt: skip
@@ -260,7 +260,7 @@ def _add_matches(  # type: ignore[no-untyped-def]
     error_model="numpy",
     nogil=True,
 )
-def _add_priors(  # type: ignore[no-untyped-def]
+def add_priors(  # type: ignore[no-untyped-def]
     x, offsets, views, distance, distance_deviation, centres, derive, H, b, H_own, b_own
 ):
     """Cost of the priors: unit variance but for the arch's centre, of which only depth has one."""
@@ -330,15 +330,15 @@ def minimise(  # type: ignore[no-untyped-def]
             x, views, nominal, angle_deviations, distance, focals, focal_deviations,
             rotations, centres, lens, jacobians,
         )  # fmt: skip
-        cost = _add_priors(
+        cost = add_priors(
             x, offsets, views, distance, distance_deviation, centres, True, H, b, H_own, b_own
         )
-        cost += _add_landmarks(
+        cost += add_landmarks(
             x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
             offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
             focal_deviations, True, H, b, H_own, b_own, H_cross,
         )  # fmt: skip
-        cost += _add_matches(
+        cost += add_matches(
             pairs, starts, matches, pair_weights, pair_deviations, rotations, centres, lens,
             jacobians, angle_deviations, focal_deviations, True, H, b,
         )  # fmt: skip
@@ -368,16 +368,16 @@ def minimise(  # type: ignore[no-untyped-def]
                 trial, views, nominal, angle_deviations, distance, focals, focal_deviations,
                 rotations, centres, lens, jacobians,
             )  # fmt: skip
-            new_cost = _add_priors(
+            new_cost = add_priors(
                 trial, trial_offsets, views, distance, distance_deviation, centres, False,
                 H, b, H_own, b_own,
             )  # fmt: skip
-            new_cost += _add_landmarks(
+            new_cost += add_landmarks(
                 trial, trial_offsets, views, view_of, landmark_of, pixels, deviations, template,
                 lower, offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
                 focal_deviations, False, H, b, H_own, b_own, H_cross,
             )  # fmt: skip
-            new_cost += _add_matches(
+            new_cost += add_matches(
                 pairs, starts, matches, pair_weights, pair_deviations, rotations, centres, lens,
                 jacobians, angle_deviations, focal_deviations, False, H, b,
             )  # fmt: skip

@@ -49,6 +49,8 @@ def relative_angle_deviation(adjusted: Adjusted, i: int, j: int, angles: Array) 
         i, j: views.
         angles: [V, 3] standard deviations of the views' rotations (degrees), the unknowns' units.
     """
+    if adjusted.held:
+        return 0.0
     covariance = np.linalg.inv(adjusted.reduced)
     to_world = np.zeros((3, len(covariance)))
     for view, sign in ((j, 1.0), (i, -1.0)):

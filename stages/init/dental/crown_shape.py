@@ -103,15 +103,23 @@ def outward(point: Array64) -> Array64:
     return direction / max(float(np.linalg.norm(direction)), 1e-9)
 
 
-def crown_points(shape: JawShape, bulge: float, flatness: float) -> Array64:
-    """Points [N, 3] on the outer faces of a jaw's crowns and on the gum beyond them, mm."""
+def crown_points(
+    shape: JawShape, bulge: float, flatness: float, gum_height: float = 0.0
+) -> Array64:
+    """Points [N, 3] on the outer faces of a jaw's crowns and on the gum beyond them, mm.
+
+    The gum goes on straight to `gum_height` where that is further than it usually bends.
+    """
     points = [point for _, point in sorted(shape.landmarks.items())]
+    steps = list(_GUM_STEPS)
+    if gum_height > steps[-1][0]:
+        steps.append((gum_height, steps[-1][1]))
     for k, tooth in enumerate(shape.teeth):
         zenith = shape.landmarks[Landmark("zenith", tooth)]
         tip = shape.landmarks[Landmark("tip", tooth)]
         out = outward(zenith)
         up = np.array([0.0, shape.gumwards, 0.0])
-        points += [zenith + up * rise + out * step for rise, step in _GUM_STEPS]
+        points += [zenith + up * rise + out * step for rise, step in steps]
         points.append(tip - up * _TIP_STEP[0] - outward(tip) * _TIP_STEP[1])
         right = shape.boundary(shape.teeth[k - 1], tooth) if k > 0 else None
         left = shape.boundary(tooth, shape.teeth[k + 1]) if k + 1 < len(shape.teeth) else None

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from stages.init.dental.anatomy import is_upper
 from stages.init.dental.arch_options import ArchOptions
 from stages.init.dental.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
+from stages.init.dental.bundle_held import HeldCameras
 from stages.init.dental.bundle_kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.sightings import NO_TOOTH, Labels, SeenRow, SightingCache
 from stages.init.dental.template import POSITIONS, position_of, textbook_arch
@@ -114,8 +115,10 @@ class Scorer:
         focal_deviations: Array,
         options: ArchOptions,
         threads: int,
+        held: HeldCameras | None = None,
     ) -> None:
         self.rows = rows
+        self.held = held
         self.cache = SightingCache(rows)
         self.focals, self.focal_deviations = focals, focal_deviations
         self.options = options
@@ -180,6 +183,8 @@ class Scorer:
             start=start,
             max_steps=max_steps,
             tolerance=0.05 if max_steps < FINAL_STEPS else 0.005,
+            # One photograph alone says nothing of how cameras lie to each other.
+            held=self.held.of(labelling.views) if self.held and len(labelling.views) > 1 else None,
         )
         self.solved += 1
         return Scored(labelling, adjusted, adjusted.evidence + self.costs(labelling))

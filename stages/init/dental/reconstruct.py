@@ -20,6 +20,7 @@ from stages.init.dental.surface import ArchSurface, dense_surface
 from stages.init.dental.surface_options import SurfaceOptions
 from stages.init.dental.turned import turned_sheet
 
+Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 
@@ -50,7 +51,7 @@ class Teeth:
 def reconstruct_teeth(
     views: list[View], names: list[str], focals: list[float | None], photo: PhotoOptions,
     arch: ArchOptions, surface: SurfaceOptions, *, accept_doubtful: bool, seed: int, threads: int,
-    progress: Progress,
+    progress: Progress, cameras: list[Array] | None = None,
 ) -> Teeth:  # fmt: skip
     """Find the teeth, say which is which, place the cameras, and make the surface.
 
@@ -59,6 +60,7 @@ def reconstruct_teeth(
         names: how the user knows them.
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
+        cameras: [4, 4] cam_from_world of each where the cameras are known (`fit_arch`).
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
@@ -75,7 +77,7 @@ def reconstruct_teeth(
             f"Teeth could be made out in {found} of {len(views)} photographs; three are needed. "
             f"{HOW_TO_SHOOT_TEETH}"
         )
-    fit = fit_arch(dentitions, images, valid, focals, arch, seed, threads, progress, names)
+    fit = fit_arch(dentitions, images, valid, focals, arch, seed, threads, progress, names, cameras)
     pictures = labelled(views, dentitions, fit)
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):

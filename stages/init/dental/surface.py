@@ -7,7 +7,7 @@ coloured once from all photographs, and seen from each of them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numba
@@ -28,7 +28,8 @@ from stages.init.dental.surface_charts import (
     start_chart,
 )
 from stages.init.dental.surface_cloud import coloured_cloud
-from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface_grow import grow_gum
+from stages.init.dental.surface_options import SurfaceOptions, SweepRound
 from stages.init.dental.surface_photo import Photo, prepare_photo
 from stages.init.dental.surface_raster import raster_chart
 from stages.init.dental.surface_sweep import choose_pairs, sweep
@@ -146,14 +147,13 @@ def _dense_surface(
             "the labelled overlay of the crowns and pass --set init.dental.order or FDI hints"
         )
     pairs = choose_pairs(photos, middle, options)
+    near = replace(options, gum_height=min(options.gum_height, options.grow_from))
     for number, settings in enumerate(options.rounds if pairs else ()):
         progress("sweep", 2 + number, steps)
-        nearest = nearest_depths(charts, photos, options.gum_height, threads)
-        seen = [comparable(chart, photos, nearest, options) for chart in charts]
-        for chart, shown in zip(charts, seen, strict=True):
-            trust = chart.gum_fades(options.gum_trust)
-            found = sweep(chart.grid, chart.radius, photos, shown, pairs, trust, settings, options)
-            chart.radius, chart.agreement = found.radius, found.weight
+        _sweep(charts, photos, pairs, settings, near, threads)
+    if pairs and options.rounds and options.gum_height > options.grow_from:
+        grow_gum(charts, photos, pairs, options, threads)
+        _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
     progress("colour", steps - 1, steps)
     for chart in charts:
         sigma = _AGREEMENT_SMOOTHING * chart.grid.density
@@ -176,6 +176,23 @@ def _dense_surface(
         faces=cloud.faces,
         gains=gains,
     )
+
+
+def _sweep(
+    charts: list[Chart],
+    photos: list[Photo],
+    pairs: list[list[int]],
+    settings: SweepRound,
+    options: SurfaceOptions,
+    threads: int,
+) -> None:
+    """One round over all charts, in place."""
+    nearest = nearest_depths(charts, photos, options.gum_height, threads)
+    seen = [comparable(chart, photos, nearest, options) for chart in charts]
+    for chart, shown in zip(charts, seen, strict=True):
+        trust = chart.gum_fades(options.gum_trust)
+        found = sweep(chart.grid, chart.radius, photos, shown, pairs, trust, settings, options)
+        chart.radius, chart.agreement = found.radius, found.weight
 
 
 def _anchor(photos: list[Photo], fit: ArchFit) -> int:
@@ -234,5 +251,5 @@ def _look(photo: Photo, charts: list[Chart], options: SurfaceOptions) -> Surface
         depth = np.where(better, z, depth)
         normal = np.where(better[..., None], turned, normal)
         agreement = np.where(better, agreed, agreement)
-    confidence = np.where(depth > 0, confidence_of(agreement), 1).astype(np.float32)
+    confidence = np.where(depth > 0, confidence_of(agreement, options.guess), 1).astype(np.float32)
     return SurfaceView(depth, normal.astype(np.float32), confidence)

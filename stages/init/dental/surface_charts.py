@@ -35,8 +35,8 @@ SOLID_PAST_EDGE = 0.3
 #: the surface, less than a tooth. Twice that while the surface is still being found.
 HIDDEN = 0.8
 #: Confidence is 1 + exp(low + (high - low) * agreement), as the dense stereo gives it: low for a
-#: guess, high for a good match.
-_CONFIDENCE = (-1.6, 2.0)
+#: guess (an option), high for a good match.
+_SURE = 2.0
 #: Smoothing of the normals that are given out, and of those that decide what faces a view (mm).
 _NORMAL_SMOOTHING, _FACING_SMOOTHING = 0.15, 1.5
 #: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
@@ -87,10 +87,12 @@ def smooth_normals(
     return normals_of(grid.points(np.asarray(smooth, np.float32)))
 
 
-def confidence_of(agreement: Array32) -> Array32:
-    """Confidence > 1 as pointmap models give it, of an agreement in 0..1."""
-    low, high = _CONFIDENCE
-    return (1 + np.exp(low + (high - low) * np.clip(agreement, 0, 1))).astype(np.float32)
+def confidence_of(agreement: Array32, guess: float) -> Array32:
+    """Confidence > 1 as pointmap models give it, of an agreement in 0..1.
+
+    Where nothing agrees it is 1 + exp(`guess`).
+    """
+    return (1 + np.exp(guess + (_SURE - guess) * np.clip(agreement, 0, 1))).astype(np.float32)
 
 
 def teeth_present(fit: ArchFit) -> tuple[set[int], set[int]]:
@@ -116,7 +118,7 @@ def start_chart(jaw: Jaw, fit: ArchFit, options: SurfaceOptions) -> Chart | None
     shape = jaw_shape(jaw, fit.shape, seen, missing)
     if shape is None:
         return None
-    points = crown_points(shape, options.crown_bulge, options.crown_flatness)
+    points = crown_points(shape, options.crown_bulge, options.crown_flatness, options.gum_height)
     up = shape.gumwards
     heights = np.array([point[1] for _, point in sorted(shape.landmarks.items())]) * up
     ends = (heights.min() - PAST_EDGE) * up, (heights.max() + options.gum_height) * up

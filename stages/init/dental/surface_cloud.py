@@ -115,7 +115,7 @@ def coloured_cloud(
                 layer.points[kept],
                 colour[kept],
                 layer.normals[kept],
-                confidence_of(agreement[kept]),
+                confidence_of(agreement[kept], options.guess),
                 (seen_tooth | hidden)[kept],
                 number[faces_of(kept)].astype(np.int32),
             )

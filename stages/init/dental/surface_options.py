@@ -60,10 +60,19 @@ class SurfaceOptions:
     partners: int = 1
     # gum shown beyond the crowns, where photographs show gum
     gum_height: float = 4.0
+    # with a larger gum_height the gum beyond this is swept strip by strip, each going on from the
+    # last; cameras must be exact for that
+    grow_from: float = 5.0
+    # height of the strips
+    grow_step: float = 2.5
+    # the sweep of each strip
+    grow_round: SweepRound = SweepRound(reach=2.4, step=0.15, window=1.6, prior=0.1, stiffness=2.0)
     # weight of what photographs agree on there, against 1 on the crowns
     gum_trust: float = 0.2
     # a pixel is gum if its colour is within so many standard deviations of that beside the crowns
     gum_deviations: float = 3.5
+    # confidence where no photographs agree is 1 + exp(this)
+    guess: float = -1.6
     # rims are smoothed over this length
     rim_smoothing: float = 0.35
     # teeth go on this far behind what hides their biting edges, as the crown shape has them

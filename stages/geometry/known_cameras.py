@@ -15,13 +15,15 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, to_uint8
 from pipeline.errors import RequestError
-from stages.init.colmap import quiet_pycolmap
+from stages.geometry.colmap import check_whole, quiet_pycolmap
 
 Array = npt.NDArray[np.float64]
 
 COLMAP_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 #: OpenGL cameras (y up, z back), which `transforms.json` holds, to OpenCV cameras.
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+#: The setting that names the cameras, where a message does not say another.
+SETTING = "init.cameras"
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,13 @@ class KnownCamera:
     cam_from_world: Array
 
 
-def model_files(path: Path) -> dict[str, Path]:
+def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
     """The files of a model: label -> file.
 
     Args:
         path: a folder with a COLMAP model (text or binary; also with ``sparse/0`` or ``0`` in it),
             a folder with a `transforms.json`, or such a file itself.
+        setting: name of the setting that gave the path, for messages.
 
     Raises:
         RequestError: there is nothing of the kind.
@@ -64,13 +67,17 @@ def model_files(path: Path) -> dict[str, Path]:
     if (path / "transforms.json").is_file():
         return {"cameras/transforms.json": path / "transforms.json"}
     raise RequestError(
-        f"init.cameras: {path} holds no cameras. Give a folder with a COLMAP model (cameras.bin "
+        f"{setting}: {path} holds no cameras. Give a folder with a COLMAP model (cameras.bin "
         "and images.bin, or .txt), or a transforms.json as nerfstudio writes it."
     )
 
 
-def read_cameras(files: Iterable[Path]) -> tuple[list[KnownCamera], str]:
+def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[KnownCamera], str]:
     """Read what `model_files` found.
+
+    Args:
+        files: those of one model.
+        setting: name of the setting that gave them, for messages.
 
     Returns:
         The posed images sorted by name, and the units (``"mm"`` where the file says so, else
@@ -83,21 +90,22 @@ def read_cameras(files: Iterable[Path]) -> tuple[list[KnownCamera], str]:
     source = files[0].parent if files[0].suffix != ".json" else files[0]
     try:
         if files[0].suffix == ".json":
-            cameras, units = _read_transforms(files[0])
+            cameras, units = _read_transforms(files[0], setting)
         else:
             cameras, units = _read_colmap(files[0].parent), "arbitrary"
     except RequestError:
         raise
     except Exception as error:
         raise RequestError(
-            f"init.cameras: {source} can't be read ({type(error).__name__}: {error}). Is it whole?"
+            f"{setting}: {source} can't be read ({type(error).__name__}: {error}). Is it whole?"
         ) from error
     if not cameras:
-        raise RequestError(f"init.cameras: {source} holds no posed image.")
+        raise RequestError(f"{setting}: {source} holds no posed image.")
     return sorted(cameras, key=lambda camera: camera.name), units
 
 
 def _read_colmap(folder: Path) -> list[KnownCamera]:
+    check_whole(folder)
     model = quiet_pycolmap().Reconstruction(str(folder))
     return [
         KnownCamera(
@@ -110,7 +118,7 @@ def _read_colmap(folder: Path) -> list[KnownCamera]:
     ]
 
 
-def _read_transforms(path: Path) -> tuple[list[KnownCamera], str]:
+def _read_transforms(path: Path, setting: str) -> tuple[list[KnownCamera], str]:
     data = json.loads(path.read_text())
     cameras = []
     for number, frame in enumerate(data["frames"]):
@@ -118,16 +126,18 @@ def _read_transforms(path: Path) -> tuple[list[KnownCamera], str]:
         pose = np.array(frame["transform_matrix"], np.float64)
         if pose.shape not in ((3, 4), (4, 4)):
             raise RequestError(
-                f"init.cameras: frame {number} of {path} has a transform_matrix of shape "
+                f"{setting}: frame {number} of {path} has a transform_matrix of shape "
                 f"{'x'.join(map(str, pose.shape))}, not 4x4."
             )
         pose = np.vstack([pose[:3], [0, 0, 0, 1]])
         cam_from_world = np.asarray(np.linalg.inv(pose @ OPENCV_FROM_OPENGL), np.float64)
-        cameras.append(KnownCamera(str(frame["file_path"]), _lens(said, path), cam_from_world))
+        cameras.append(
+            KnownCamera(str(frame["file_path"]), _lens(said, path, setting), cam_from_world)
+        )
     return cameras, "mm" if data.get("units") == "mm" else "arbitrary"
 
 
-def _lens(said: Mapping[str, Any], path: Path) -> Any:
+def _lens(said: Mapping[str, Any], path: Path, setting: str) -> Any:
     try:
         width, height = int(said["w"]), int(said["h"])
         if "fl_x" in said:
@@ -136,7 +146,7 @@ def _lens(said: Mapping[str, Any], path: Path) -> Any:
             fx = 0.5 * width / np.tan(0.5 * float(said["camera_angle_x"]))
     except KeyError as error:
         raise RequestError(
-            f"init.cameras: {path} gives no {error} for {said.get('file_path', 'a frame')}. It "
+            f"{setting}: {path} gives no {error} for {said.get('file_path', 'a frame')}. It "
             "needs w, h and fl_x (or camera_angle_x), for all frames or for each."
         ) from None
     fisheye = "FISHEYE" in str(said.get("camera_model", ""))
@@ -152,8 +162,15 @@ def _lens(said: Mapping[str, Any], path: Path) -> Any:
     )  # fmt: skip
 
 
-def matching_cameras(cameras: list[KnownCamera], views: Iterable[View]) -> dict[str, KnownCamera]:
+def matching_cameras(
+    cameras: list[KnownCamera], views: Iterable[View], setting: str = SETTING
+) -> dict[str, KnownCamera]:
     """Name of a view -> its camera: by the name of the source file, with or without suffix.
+
+    Args:
+        cameras: of the model.
+        views: with names of their own.
+        setting: name of the setting that gave the model, for messages.
 
     Raises:
         RequestError: fewer than two views have a camera, or one has several.
@@ -176,42 +193,61 @@ def matching_cameras(cameras: list[KnownCamera], views: Iterable[View]) -> dict[
         several = next((name for name, those in fitting.items() if len(those) > 1), None)
         if several is not None:
             raise RequestError(
-                f"init.cameras: {len(fitting[several])} cameras fit one photograph "
+                f"{setting}: {len(fitting[several])} cameras fit one photograph "
                 f"({', '.join(camera.name for camera in fitting[several][:3])}). Give each image a "
                 "name of its own."
             )
         if len(found) >= 2:
             return found
     raise RequestError(
-        f"init.cameras: fewer than two of the {len(views)} photographs have a camera in the model. "
+        f"{setting}: fewer than two of the {len(views)} photographs have a camera in the model. "
         f"The names there are like {cameras[0].name}, the photographs' like "
         f"{views[0].source_name or views[0].name}."
     )
 
 
-def as_pinhole(view: View, known: KnownCamera) -> tuple[View, Camera]:
-    """The view as a pinhole camera sees it, and that camera, in the model's world.
+def pinhole_camera(view: View, known: KnownCamera, setting: str = SETTING) -> Camera:
+    """The camera of a view without the distortion of its lens, in the model's world.
 
     The lens may refer to the stored pixel grid of the photograph, to the upright one, or to either
-    at another size. Distortion is taken out of the image; what the lens did not see is masked.
+    at another size.
 
     Raises:
         RequestError: the lens's image has another shape than the photograph.
     """
     lens = known.lens
-    working_from_lens = _working_from_lens(view, known)
+    working_from_lens = _working_from_lens(view, known, setting)
     linear = working_from_lens[:2, :2]
-    # A x K = K' x R: rows of A are axes of the working image, turned by quarters at most.
-    turn = np.eye(3)
-    turn[:2, :2] = np.sign(np.where(np.abs(linear) > 1e-9, linear, 0))
     focal = np.abs(linear) @ np.array([lens.focal_length_x, lens.focal_length_y])
     centre = working_from_lens @ np.array([lens.principal_point_x, lens.principal_point_y, 1.0])
     pose = np.eye(4)
-    pose[:3] = turn @ known.cam_from_world[:3]
-    camera = Camera(
+    pose[:3] = _turn(working_from_lens) @ known.cam_from_world[:3]
+    return Camera(
         view.name, view.width, view.height, float(focal[0]), float(focal[1]),
         float(centre[0]), float(centre[1]), pose,
     )  # fmt: skip
+
+
+def _turn(working_from_lens: Array) -> Array:
+    """[3, 3] R in A K = K' R: rows of A are axes of the working image, turned by quarters."""
+    linear = working_from_lens[:2, :2]
+    turn = np.eye(3)
+    turn[:2, :2] = np.sign(np.where(np.abs(linear) > 1e-9, linear, 0))
+    return turn
+
+
+def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[View, Camera]:
+    """The view as a pinhole camera sees it, and that camera (`pinhole_camera`).
+
+    Distortion is taken out of the image; what the lens did not see is masked.
+
+    Raises:
+        RequestError: the lens's image has another shape than the photograph.
+    """
+    lens = known.lens
+    camera = pinhole_camera(view, known, setting)
+    working_from_lens = _working_from_lens(view, known, setting)
+    turn = _turn(working_from_lens)
     distortion = [lens.params[index] for index in lens.extra_params_idxs()]
     if not np.any(np.abs(distortion) > 1e-9):
         return view, camera
@@ -254,7 +290,7 @@ def rounded(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
     return to_uint8(image).astype(np.float32) / np.float32(255)
 
 
-def _working_from_lens(view: View, known: KnownCamera) -> Array:
+def _working_from_lens(view: View, known: KnownCamera, setting: str) -> Array:
     """[3, 3] affine map from the pixels of the model's image to the view's."""
     lens = known.lens
     width, height = view.source_size if min(view.source_size) > 0 else (view.width, view.height)
@@ -266,7 +302,7 @@ def _working_from_lens(view: View, known: KnownCamera) -> Array:
     if abs(np.log(shape / upright)) < 0.02:
         return np.diag([view.width / lens.width, view.height / lens.height, 1.0])
     raise RequestError(
-        f"init.cameras: the camera of {known.name} is for an image of {lens.width} x {lens.height} "
+        f"{setting}: the camera of {known.name} is for an image of {lens.width} x {lens.height} "
         f"pixels, but the photograph {view.source_name or view.name} has {width} x {height}. Give "
         "the photographs that the cameras were made from."
     )

@@ -1,0 +1,230 @@
+"""Photometric refinement of a camera before a finished scene: the Gaussians stay as they are.
+
+InstantSplat and CF-3DGS do this for test photographs by several hundred steps of Adam. The
+objective here is theirs (mean absolute colour error where something is rendered, the best pose
+kept); it is minimised by reweighted Gauss-Newton steps over an image pyramid, which take a tenth of
+the renders. The derivative by the six motions of the camera is a difference of renders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from stages.geometry.rigid import moved_by
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+
+#: Motion of the picture, in pixels, that a derivative is the difference over.
+_PROBE = 0.3
+#: Sides of a picture that still tells something, in pixels.
+SMALLEST_SIDE = 16
+#: Errors below this count squared: half a step of 8 bits.
+_SMALLEST_ERROR = 0.002
+#: Damping of the steps, as a share of the mean curvature, and by what it grows and shrinks. A turn
+#: and a shift that undo each other hardly show: without damping they run away.
+_DAMPING, _GROWTH, _MOST_DAMPING = 0.03, 5.0, 1e4
+
+
+class Picture(Protocol):
+    """What a renderer returns."""
+
+    @property
+    def image(self) -> Floats:
+        """[H, W, 3]."""
+
+    @property
+    def alpha(self) -> Floats:
+        """[H, W]."""
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """How test cameras are refined."""
+
+    #: image sizes, coarse to fine, as divisors of the full size
+    factors: tuple[int, ...] = (8, 4, 2, 1)
+    #: in pictures coarser than this the camera only turns: a shift looks like a turn there, and
+    #: both together run away
+    shifts_from: int = 2
+    #: Gauss-Newton steps at each size
+    steps: int = 20
+    #: a step that moves the picture by less than this, in pixels, is the last of its size
+    tolerance: float = 0.01
+    #: and so is one that lessens the error by less than this, relative
+    least_gain: float = 2e-4
+    #: damping of the steps never gets less than this share of the mean curvature
+    least_damping: float = 1e-4
+    #: the pyramid is gone through again, at most so often, while that lessens the error by a share
+    rounds: int = 5
+    round_gain: float = 0.05
+    #: alpha above which something is rendered
+    rendered: float = 0.5
+    #: the picture may lose so much of what is rendered at the start
+    least_covered: float = 0.8
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Attributes:
+    camera: with the best pose.
+    before, after: mean absolute error where something is rendered, in 0..1.
+    renders: how many pictures were rendered.
+    """
+
+    camera: Camera
+    before: float
+    after: float
+    renders: int
+
+
+class _Level:
+    """One size of the photograph."""
+
+    def __init__(
+        self, render: Callable[[Camera], Picture], photo: Floats, valid: Bools, camera: Camera,
+        factor: int, options: RefinementOptions,
+    ) -> None:  # fmt: skip
+        width, height = max(1, camera.width // factor), max(1, camera.height // factor)
+        self.size = (width, height)
+        self.blurred = factor > 1
+        #: motions that are solved for: shifts are the first three, turns the others
+        self.motions = range(6) if factor <= options.shifts_from else range(3, 6)
+        self.options = options
+        self.draw = render
+        self.renders = 0
+        share = cv2.resize(valid.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)
+        self.valid = np.asarray(share > 0.99)
+        small = cv2.resize(photo, self.size, interpolation=cv2.INTER_AREA)
+        self.photo = self._smooth(np.asarray(small, np.float32))
+
+    def _smooth(self, image: Floats) -> Floats:
+        """Coarse pictures are blurred: their slopes must reach farther than a pixel."""
+        if not self.blurred:
+            return image
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.float32)
+
+    def render(self, camera: Camera) -> tuple[Floats, Bools]:
+        """The picture [H, W, 3], and where [H, W] it is compared."""
+        self.renders += 1
+        picture = self.draw(camera.resized(*self.size))
+        seen = np.asarray(picture.alpha) > self.options.rendered
+        return self._smooth(np.clip(picture.image, 0, 1)), self.valid & seen
+
+    def error(self, image: Floats, counted: Bools) -> float:
+        if not counted.any():
+            return np.inf
+        return float(np.abs(image - self.photo)[counted].mean(dtype=np.float64))
+
+
+def refine_camera(
+    render: Callable[[Camera], Picture],
+    photo: Floats,
+    valid: Bools,
+    camera: Camera,
+    depth: float,
+    options: RefinementOptions,
+) -> Refined:
+    """Move a camera so that its picture of the scene is most like the photograph.
+
+    Args:
+        render: draws the scene as a camera sees it, at the camera's size.
+        photo: [H, W, 3] float32 in 0..1; valid: [H, W] pixels that count.
+        camera: to start from, of the photograph's size.
+        depth: of the scene before it, in world units: translations are relative to it.
+        options: see there.
+    """
+    full = _Level(render, photo, valid, camera, 1, options)
+    image, counted = full.render(camera)
+    before, covered = full.error(image, counted), int(counted.sum())
+    best, least, renders = camera, before, 1
+    levels = [_Level(render, photo, valid, camera, factor, options) for factor in options.factors]
+    last = np.inf
+    for level in levels * options.rounds:
+        if level is levels[0]:
+            if least > (1 - options.round_gain) * last:
+                break
+            last = least
+        if min(level.size) < SMALLEST_SIDE:
+            continue
+        # a coarse picture's best is not quite the sharp one's: it is left where that is no better
+        found = _descend(level, best, depth, options)
+        image, counted = full.render(found)
+        error = full.error(image, counted)
+        renders += 1
+        if error < least and counted.sum() >= options.least_covered * covered:
+            best, least = found, error
+    renders += sum(level.renders for level in levels)
+    return Refined(best, before, least, renders)
+
+
+def _descend(level: _Level, camera: Camera, depth: float, options: RefinementOptions) -> Camera:
+    """Damped Gauss-Newton steps on the reweighted squares at one size.
+
+    The derivative serves for several steps, until one of them does not help.
+    """
+    image, counted = level.render(camera)
+    error, covered = level.error(image, counted), int(counted.sum())
+    # what moves the picture by about a pixel: shifts in the first three, turns in the others
+    pixel = camera.width / (level.size[0] * camera.fx)
+    unit = np.array([depth, depth, depth, 1, 1, 1]) * pixel
+    damping, slopes, fresh = _DAMPING, None, False
+    for _ in range(options.steps):
+        if not np.isfinite(error):
+            break
+        if slopes is None:
+            slopes, fresh = _slopes(level, camera, image, unit), True
+        matrix, vector = _normal_equations(slopes, image - level.photo, counted)
+        ridge = damping * float(np.trace(matrix)) / len(vector) + 1e-12
+        step = np.zeros(6)
+        step[level.motions] = -np.linalg.solve(matrix + ridge * np.eye(len(vector)), vector)
+        moved = replace(camera, cam_from_world=moved_by(step * unit, camera.cam_from_world))
+        trial, seen = level.render(moved)
+        value = level.error(trial, seen)
+        if value < error and seen.sum() >= options.least_covered * covered:
+            gain = 1 - value / error
+            camera, image, counted, error = moved, trial, seen, value
+            damping, fresh = max(damping / _GROWTH, options.least_damping), False
+            if np.abs(step).max() < options.tolerance or gain < options.least_gain:
+                break
+        elif not fresh:
+            slopes = None
+        else:
+            damping *= _GROWTH
+            if damping > _MOST_DAMPING or np.abs(step).max() < options.tolerance:
+                break
+    return camera
+
+
+def _slopes(level: _Level, camera: Camera, image: Floats, unit: Array) -> list[Floats]:
+    """Pictures [H, W, 3]: change by each motion of the camera, per `unit`."""
+    slopes = []
+    for index in level.motions:
+        twist = np.zeros(6)
+        twist[index] = _PROBE * unit[index]
+        moved = replace(camera, cam_from_world=moved_by(twist, camera.cam_from_world))
+        probe, _ = level.render(moved)
+        slopes.append((probe - image) / np.float32(_PROBE))
+    return slopes
+
+
+def _normal_equations(
+    slopes: list[Floats], residual: Floats, counted: Bools
+) -> tuple[Array, Array]:
+    """[M, M] and [M] of the step that lessens the weighted squares most."""
+    error = residual[counted].reshape(-1)
+    weight = 1 / np.maximum(np.abs(error), np.float32(_SMALLEST_ERROR))
+    columns = [slope[counted].reshape(-1) for slope in slopes]
+    weighted = [column * weight for column in columns]
+    # sums in numpy's own order: a BLAS product may differ with the number of threads
+    matrix = [[float(np.sum(a * b, dtype=np.float64)) for b in columns] for a in weighted]
+    vector = [float(np.sum(a * error, dtype=np.float64)) for a in weighted]
+    return np.array(matrix), np.array(vector)

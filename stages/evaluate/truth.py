@@ -1,0 +1,89 @@
+"""What the user knows of a scene to test with: true cameras, and masks to score in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View
+from pipeline.errors import RequestError
+from stages.evaluate.held_out import without_lens
+from stages.geometry.known_cameras import matching_cameras, pinhole_camera, read_cameras
+
+Mask = npt.NDArray[np.bool_]
+
+SETTING = "evaluate.ground_truth"
+#: Masks are 255 where they count; what is less (gum may be 128) does not.
+_COUNTS = 250
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Attributes:
+    cameras: name of a view -> its true camera, for the view's image, without lens distortion.
+    units: of their world, ``"mm"`` or ``"arbitrary"``.
+    """
+
+    cameras: Mapping[str, Camera]
+    units: str
+
+
+def read_truth(files: Iterable[Path], views: Sequence[View]) -> Truth:
+    """True cameras of views, by the names of their files.
+
+    Raises:
+        RequestError: the files are damaged, or have no camera of at least two of the views.
+    """
+    known, units = read_cameras(files, SETTING)
+    matched = matching_cameras(known, views, SETTING)
+    cameras = {
+        view.name: pinhole_camera(view, matched[view.name], SETTING)
+        for view in views
+        if view.name in matched
+    }
+    return Truth(cameras, units)
+
+
+def scoring_mask(files: Mapping[str, Path], view: View) -> Mask | None:
+    """[H, W] where a view is scored by itself, or None where no file is named as its photograph.
+
+    Args:
+        files: file name -> mask of the photograph, in its pixels or at the view's aspect.
+        view: its lens is taken out of the mask as it was of the image.
+
+    Raises:
+        RequestError: the mask can't be read, or has another shape than the photograph.
+    """
+    source = PurePath(view.source_name).name or view.name
+    names = {PurePath(name).stem: path for name, path in sorted(files.items())}
+    path = names.get(source) or names.get(PurePath(source).stem)
+    if path is None:
+        return None
+    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if stored is None:
+        raise RequestError(f"evaluate.masks: {path} is not a readable picture.")
+    height, width = stored.shape
+    if (width, height) == view.source_size:
+        source_from_working = np.linalg.inv(view.working_from_source)
+    elif abs(np.log(width * view.height / (height * view.width))) < 0.02:
+        source_from_working = np.diag([width / view.width, height / view.height, 1.0])
+    else:
+        raise RequestError(
+            f"evaluate.masks: {path.name} has {width} x {height} pixels, but the photograph "
+            f"{source} {view.source_size[0]} x {view.source_size[1]}. Give masks of its size."
+        )
+    v, u = np.mgrid[: view.height, : view.width] + 0.5
+    position = np.stack([u, v, np.ones_like(u)], -1) @ source_from_working.T
+    column = np.clip(np.floor(position[..., 0]), 0, width - 1).astype(np.int64)
+    row = np.clip(np.floor(position[..., 1]), 0, height - 1).astype(np.int64)
+    mask = np.asarray(stored[row, column] >= _COUNTS)
+    if view.lens_taken_out:
+        straight = without_lens(replace(view, mask=mask), view.lens_taken_out)
+        mask = straight.valid()
+    return mask

@@ -1,0 +1,268 @@
+"""The bundle adjustment of `bundle` with cameras that are known: only the arch moves.
+
+The cameras hold still relative to each other; free are a similarity (turn, shift, and how many
+millimetres the cameras' unit is) that carries all of them around the arch, the arch's shape and the
+landmarks. The normal equations are those of free cameras, projected onto what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from stages.init.dental.bundle_algebra import (
+    cholesky,
+    eliminate,
+    rotation_and_jacobian,
+    solve_cholesky,
+)
+from stages.init.dental.bundle_kernels import (
+    CENTRE_UNIT,
+    PER_ARCH,
+    PER_VIEW,
+    add_landmarks,
+    add_priors,
+    place_cameras,
+)
+
+Array = npt.NDArray[np.float64]
+
+#: Unknowns of the similarity: turn, shift, log scale.
+PER_SIMILARITY = 7
+
+
+@dataclass(frozen=True)
+class HeldCameras:
+    """Known cameras, in a world of any unit, as `Sightings` sees them (rolls taken out).
+
+    Attributes:
+        rotations: [V, 3, 3] camera from world.
+        translations: [V, 3] in the unit of that world.
+    """
+
+    rotations: Array
+    translations: Array
+
+    def of(self, views: tuple[int, ...]) -> HeldCameras:
+        """Those of some views."""
+        chosen = list(views)
+        return HeldCameras(self.rotations[chosen], self.translations[chosen])
+
+    def from_first(self) -> tuple[Array, Array]:
+        """Rotations [V, 3, 3] and translations [V, 3] from the first camera's frame; the distances
+        of the cameras from the first one are 1 on average."""
+        turn = self.rotations @ self.rotations[0].T
+        shift = self.translations - turn @ self.translations[0]
+        unit = max(float(np.linalg.norm(shift[1:], axis=1).mean()), 1e-12)
+        return np.ascontiguousarray(turn), np.ascontiguousarray(shift / unit)
+
+
+def roll_matrix(roll: float) -> Array:
+    """[3, 3] camera from the same camera with the roll (radians) of the teeth taken out."""
+    c, s = np.cos(roll), np.sin(roll)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def held_cameras(cameras: list[Array], rolls: list[float]) -> HeldCameras:
+    """Known cameras ([4, 4] cam_from_world each) with the rolls of the teeth taken out."""
+    poses = [roll_matrix(roll).T @ pose[:3] for pose, roll in zip(cameras, rolls, strict=True)]
+    return HeldCameras(
+        np.stack([pose[:, :3] for pose in poses]), np.stack([pose[:, 3] for pose in poses])
+    )
+
+
+def nearest_similarity(
+    rotations: Array, centres: Array, turns: Array, shifts: Array
+) -> tuple[Array, Array, float]:
+    """The place of the arch before held cameras that comes nearest to free ones.
+
+    Args:
+        rotations: [V, 3, 3] of the free cameras, camera from arch.
+        centres: [V, 3] mm, the arch's centre in their frames.
+        turns, shifts: the held cameras (`HeldCameras.from_first`).
+
+    Returns:
+        Rotation [3, 3] of the arch and its centre [3] mm in the first camera's frame, and the
+        logarithm of how many mm the unit of the shifts is.
+    """
+    product = np.einsum("vji,vjk->ik", turns, rotations)
+    u, _, vt = np.linalg.svd(product)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    free = -np.einsum("vji,vj->vi", rotations, centres)
+    held = -np.einsum("vji,vj->vi", turns, shifts)
+    spread = float(np.linalg.norm(held - held.mean(0)))
+    scale = max(float(np.linalg.norm(free - free.mean(0))), 1e-6) / max(spread, 1e-12)
+    centre = np.einsum("vji,vj->vi", turns, centres - scale * shifts).mean(0)
+    return np.ascontiguousarray(rotation), centre, float(np.log(scale))
+
+
+@njit(
+    "void(float64[:,::1], float64[::1], float64, float64[:,:,::1], float64[:,::1],"
+    " float64[:,:,::1], float64[:,::1], float64, float64[::1])",
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def unknowns_of(  # type: ignore[no-untyped-def]
+    rotation, centre, log_scale, turns, shifts, nominal, angle_deviations, distance, x
+):
+    """Write the views' unknowns (those of `bundle`) of a similarity into x [7V + 9]."""
+    scale = np.exp(log_scale)
+    for v in range(len(turns)):
+        turn = np.ascontiguousarray(turns[v])
+        # exp([w]x) = (camera from arch) nominal^T.
+        D = turn @ rotation @ np.ascontiguousarray(nominal[v].T)
+        axis = np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+        sine = 0.5 * np.sqrt((axis**2).sum())
+        angle = np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1))
+        factor = 0.5 if sine < 1e-9 else 0.5 * angle / sine
+        place = turn @ centre
+        for a in range(3):
+            x[PER_VIEW * v + a] = factor * axis[a] / angle_deviations[v, a]
+            x[PER_VIEW * v + 3 + a] = (place[a] + scale * shifts[v, a]) / CENTRE_UNIT
+        x[PER_VIEW * v + 5] -= distance / CENTRE_UNIT
+        x[PER_VIEW * v + 6] = 0.0
+
+
+@njit(
+    "void(float64, float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
+    " float64[:,::1])",
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
+    """T [7V + 9, 16]: how the views' unknowns and the arch's follow similarity and arch."""
+    T[:] = 0
+    views = len(turns)
+    scale = np.exp(log_scale)
+    for v in range(views):
+        # Turning the arch by w in the first camera's frame turns it by (turn w) in this one.
+        turned = np.linalg.solve(jacobians[v], np.ascontiguousarray(turns[v]))
+        for a in range(3):
+            for c in range(3):
+                T[PER_VIEW * v + a, c] = turned[a, c] / angle_deviations[v, a]
+                T[PER_VIEW * v + 3 + a, 3 + c] = turns[v, a, c]
+            T[PER_VIEW * v + 3 + a, 6] = scale * shifts[v, a] / CENTRE_UNIT
+    for k in range(PER_ARCH):
+        T[PER_VIEW * views + k, PER_SIMILARITY + k] = 1
+
+
+@njit(
+    "UniTuple(float64, 2)(float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64,"
+    " float64[:,:,::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1], float64[:,::1],"
+    " float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1], float64, float64,"
+    " float64[::1], float64[::1], int64, float64, float64[:,::1])",
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def minimise_held(  # type: ignore[no-untyped-def]
+    x, offsets, rotation, centre, log_scale, turns, shifts, view_of, landmark_of, pixels,
+    deviations, template, lower, offset_deviation, nominal, angle_deviations, distance,
+    distance_deviation, focals, focal_deviations, max_steps, tolerance, S,
+):  # fmt: skip
+    """Levenberg-Marquardt from a similarity, the arch's part of x [7V + 9] and offsets [N, 3].
+
+    x and offsets are changed in place; the views' part of x follows the similarity.
+
+    Returns cost and log determinant of the Hessian at the end; S [16, 16] becomes the reduced
+    Hessian of similarity and arch.
+    """
+    views = len(turns)
+    n, m, count = len(x), PER_SIMILARITY + PER_ARCH, len(offsets)
+    arch = PER_VIEW * views
+    rotations, jacobians = np.empty((views, 3, 3)), np.empty((views, 3, 3))
+    centres, lens = np.empty((views, 3)), np.empty(views)
+    H, b = np.zeros((n, n)), np.zeros(n)
+    H_own, b_own = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    H_cross, own_inverse = np.zeros((count, n, 3)), np.empty((count, 3, 3))
+    crossed = np.empty((count, m, 3))
+    T = np.empty((n, m))
+    s, step, L = np.empty(m), np.empty(m), np.zeros((m, m))
+    small, small_jacobian, w = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    trial, trial_offsets = np.empty(n), np.empty((count, 3))
+    damping, cost, finished = 1e-3, 0.0, False
+    held_H, held_b = np.empty((m, m)), np.empty(m)
+    unknowns_of(rotation, centre, log_scale, turns, shifts, nominal, angle_deviations, distance, x)
+    for iteration in range(max_steps + 1):
+        H[:], b[:], H_own[:], b_own[:], H_cross[:] = 0, 0, 0, 0, 0
+        place_cameras(
+            x, views, nominal, angle_deviations, distance, focals, focal_deviations,
+            rotations, centres, lens, jacobians,
+        )  # fmt: skip
+        cost = add_priors(
+            x, offsets, views, distance, distance_deviation, centres, True, H, b, H_own, b_own
+        )
+        cost += add_landmarks(
+            x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
+            offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
+            focal_deviations, True, H, b, H_own, b_own, H_cross,
+        )  # fmt: skip
+        _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
+        held_H[:] = T.T @ (H @ T)
+        held_b[:] = T.T @ b
+        for i in range(count):
+            crossed[i] = T.T @ H_cross[i]
+        if finished or iteration == max_steps:
+            break
+        improved = False
+        for _ in range(8):
+            eliminate(held_H, held_b, H_own, b_own, crossed, damping, S, s, own_inverse)
+            if np.isnan(cholesky(S, L)):
+                damping = max(damping, 1e-4) * 10
+                continue
+            solve_cholesky(L, s, step)
+            for i in range(count):
+                for a in range(3):
+                    change = 0.0
+                    for c in range(3):
+                        g = b_own[i, c]
+                        for k in range(m):
+                            g -= crossed[i, k, c] * step[k]
+                        change += own_inverse[i, a, c] * g
+                    trial_offsets[i, a] = offsets[i, a] - change
+            for a in range(3):
+                w[a] = -step[a]
+            rotation_and_jacobian(w, small, small_jacobian)
+            trial_rotation = small @ rotation
+            trial_centre = centre - CENTRE_UNIT * step[3:6]
+            trial_scale = log_scale - step[6]
+            for k in range(PER_ARCH):
+                trial[arch + k] = x[arch + k] - step[PER_SIMILARITY + k]
+            unknowns_of(
+                trial_rotation, trial_centre, trial_scale, turns, shifts, nominal,
+                angle_deviations, distance, trial,
+            )  # fmt: skip
+            place_cameras(
+                trial, views, nominal, angle_deviations, distance, focals, focal_deviations,
+                rotations, centres, lens, jacobians,
+            )  # fmt: skip
+            new_cost = add_priors(
+                trial, trial_offsets, views, distance, distance_deviation, centres, False,
+                H, b, H_own, b_own,
+            )  # fmt: skip
+            new_cost += add_landmarks(
+                trial, trial_offsets, views, view_of, landmark_of, pixels, deviations, template,
+                lower, offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
+                focal_deviations, False, H, b, H_own, b_own, H_cross,
+            )  # fmt: skip
+            if new_cost < cost:
+                improved = True
+                finished = cost - new_cost < tolerance
+                x[:] = trial
+                offsets[:] = trial_offsets
+                rotation[:] = trial_rotation
+                centre[:] = trial_centre
+                log_scale = trial_scale
+                damping = max(damping * 0.2, 1e-7)
+                break
+            damping = max(damping, 1e-5) * 8
+        if not improved:
+            finished = True
+    log_determinant = eliminate(held_H, held_b, H_own, b_own, crossed, 0.0, S, s, own_inverse)
+    log_determinant += cholesky(S, L)
+    return cost, log_determinant

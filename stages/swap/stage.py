@@ -1,0 +1,99 @@
+"""The `swap` stage: a model's cameras in place of those that earlier stages found.
+
+It may stand after any stage that gives cameras: ``--stages views,init,align,swap,sap,flow,fit``
+with ``--set swap.cameras=MODEL``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from pipeline.errors import RequestError
+from pipeline.stage import Stage, StageConfig, StageContext, runtime
+
+SETTING = "swap.cameras"
+
+
+class SwapConfig(StageConfig):
+    """Settings of the stage `swap`."""
+
+    cameras: str | None = runtime(
+        None,
+        description="cameras to use from here on: folder of a COLMAP model, or a transforms.json",
+    )
+    lenses: bool = Field(
+        True, description="take the model's focal lengths and principal points too, not only poses"
+    )
+
+
+class SwapStage(Stage):
+    """cameras of earlier stages -> those of a model, in the same world."""
+
+    name: ClassVar[str] = "swap"
+    version: ClassVar[int] = 1
+    summary: ClassVar[str] = "put a COLMAP model's cameras in place of those of the earlier stages"
+    Config: ClassVar[type[StageConfig]] = SwapConfig
+    requires: ClassVar[tuple[str, ...]] = ("views", "cameras")
+    provides: ClassVar[tuple[str, ...]] = ("cameras",)
+    libraries: ClassVar[tuple[str, ...]] = ("pycolmap", "numpy")
+
+    def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
+        from stages.geometry.known_cameras import model_files
+
+        if config.cameras is None:
+            raise RequestError(
+                "The stage 'swap' puts given cameras in place of those found, but none are given. "
+                "Pass --set swap.cameras=PATH with the folder of a COLMAP model or a "
+                "transforms.json."
+            )
+        return model_files(Path(config.cameras), SETTING)
+
+    def run(self, context: StageContext) -> None:
+        """Bring the model's cameras into the world of the present ones, so that points stay valid.
+
+        Raises:
+            RequestError: fewer than two views have both.
+        """
+        from dataclasses import replace
+
+        from pipeline.artifacts.cameras import Cameras
+        from stages.geometry.known_cameras import matching_cameras, pinhole_camera, read_cameras
+        from stages.geometry.world import move_camera, similarity_between
+
+        config: SwapConfig = context.config
+        views, present = context.load("views"), context.load("cameras")
+        known = matching_cameras(
+            read_cameras(context.sources.values(), SETTING)[0], views.views, SETTING
+        )
+        given = {
+            view.name: pinhole_camera(view, known[view.name], SETTING)
+            for view in views.views
+            if view.name in known
+        }
+        now = present.by_name()
+        both = [name for name in given if name in now]
+        if len(both) < 2:
+            raise RequestError(
+                f"swap.cameras: only {len(both)} of the photographs have a camera both in the "
+                "model and from the earlier stages; it takes two to bring one to the other."
+            )
+        motion = similarity_between([given[name] for name in both], [now[name] for name in both])
+        moved = {name: move_camera(camera, motion) for name, camera in given.items()}
+        if not config.lenses:
+            moved = {
+                name: replace(now[name], cam_from_world=moved[name].cam_from_world) for name in both
+            }
+        dropped = sorted(set(now) - set(moved))
+        if dropped:
+            context.warn(f"The model has no camera of view {', '.join(dropped)}; left out.")
+        context.save(
+            Cameras(
+                tuple(moved[view.name] for view in views.views if view.name in moved),
+                present.input_from_world, present.units,
+            )
+        )  # fmt: skip
+        context.summarize(views=len(moved), views_total=len(views))
