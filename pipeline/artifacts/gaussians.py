@@ -1,7 +1,8 @@
 """`gaussians`: the fitted 3D Gaussians, as the standard 3DGS `.ply` (62 properties).
 
 Gaussians fitted with a light beside the lens have a second file, `light.safetensors`, with what
-spherical harmonics can't express; a viewer that knows the `.ply` alone shows the harmonics.
+spherical harmonics can't express; a viewer that knows the `.ply` alone shows the harmonics. The
+colour behind them, where it is known and not black, is in `background.json`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
+from pipeline.files import read_json, write_json
 
 Array = npt.NDArray[np.float32]
 
@@ -63,6 +65,7 @@ class Gaussians(Artifact):
         sh: [N, 16, 3] float32; coefficient 0 is the constant (f_dc), colour = .5 + sum(sh * basis).
         light: what shows them better than `sh` where a light beside the lens lit the scene, or
             None.
+        background: sRGB colour in 0..1 of what is behind them all.
     """
 
     kind: ClassVar[str] = "gaussians"
@@ -72,6 +75,7 @@ class Gaussians(Artifact):
     logit_opacities: Array
     sh: Array
     light: Light | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -80,12 +84,19 @@ class Gaussians(Artifact):
         write_gaussians_ply(folder / "gaussians.ply", self)
         if self.light is not None:
             write_light(folder / "light.safetensors", self.light)
+        if any(self.background):
+            write_json(folder / "background.json", {"background": list(self.background)})
 
     @classmethod
     def load(cls, folder: Path) -> Self:
         lit = folder / "light.safetensors"
         light = read_light(lit) if lit.exists() else None
-        return cls(**read_gaussians_ply(folder / "gaussians.ply"), light=light)
+        said = read_json(folder / "background.json") or {"background": (0.0, 0.0, 0.0)}
+        red, green, blue = said["background"]
+        return cls(
+            **read_gaussians_ply(folder / "gaussians.ply"), light=light,
+            background=(red, green, blue),
+        )  # fmt: skip
 
 
 def ply_properties() -> list[str]:

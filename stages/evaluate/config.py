@@ -15,8 +15,8 @@ Distance = Annotated[float, Field(gt=0)]
 class EvaluateConfig(StageConfig):
     """Settings of the evaluate stage."""
 
-    background: tuple[Channel, Channel, Channel] = Field(
-        (0.0, 0.0, 0.0), description="Colour behind the scene, RGB in 0..1."
+    background: tuple[Channel, Channel, Channel] | None = Field(
+        None, description="Colour behind the scene, RGB in 0..1; null: the scene's own."
     )
     comparisons: bool = Field(
         True, description="Write comparison_<view>.png: photograph | render | error."

@@ -76,7 +76,8 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
         kept_back: HeldOut = context.load("held_out")
         held = kept_back.views
     cameras = _placed_cameras(views, context.load("cameras"))
-    draw = partial(render, gaussians, background=config.background, threads=context.threads)
+    background = config.background or gaussians.background
+    draw = partial(render, gaussians, background=background, threads=context.threads)
     masks = labelled(context.sources, "masks")
     truth = _truth(context, [*views.views, *held])
     held = _straightened(context, views, cameras, held) if truth is not None else held
@@ -88,6 +89,7 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
         Lpips.from_file(weights) if weights is not None else None,
     )  # fmt: skip
     figures, surfaces = _input_views(context, examiner, views, cameras)
+    figures["background"] = list(background)
     depth = scene_depth(gaussians.means, list(cameras.values()))
     if truth is not None:
         placed = {name: cameras[name] for name in cameras if name in truth.cameras}
@@ -188,7 +190,6 @@ def _input_views(
     summary = summary_of(figures)
     return {
         "protocol": PROTOCOL,
-        "background": list(config.background),
         "views": figures,
         **summary,
         "coverage": summary["mean"]["coverage"],
@@ -263,14 +264,15 @@ def _geometry(
     if not files:
         return None
     from stages.evaluate.geometry import geometry_figures
-    from stages.evaluate.surface import Mesh
+    from stages.geometry.mesh import Mesh
 
     config: EvaluateConfig = context.config
     context.progress("geometry", 0, 1)
     cloud = context.load("points").positions if context.has("points") else None
     block = geometry_figures(
-        Mesh.read(next(iter(files.values()))), surfaces, truth.cameras, registration,
-        examiner.regions, cloud, config.align, config.geometry_distances, truth.units,
+        Mesh.read(next(iter(files.values())), "evaluate.mesh"), surfaces, truth.cameras,
+        registration, examiner.regions, cloud, config.align, config.geometry_distances,
+        truth.units,
     )  # fmt: skip
     context.progress("geometry", 1, 1)
     if block is None:

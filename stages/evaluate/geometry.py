@@ -12,7 +12,8 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from stages.evaluate.held_out import ALIGNMENT, Registration
 from stages.evaluate.support import SeenSurface, supporting_views
-from stages.evaluate.surface import Mesh, icp, surface_figures
+from stages.evaluate.surface import icp, surface_figures
+from stages.geometry.mesh import Mesh
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

@@ -22,7 +22,6 @@ VGG_FILE = "vgg16-397923af.pth"
 #: Index of VGG-16's convolutions in torchvision's `features`, by the block that LPIPS looks at; a
 #: block ends with the ReLU whose output is compared, and all but the first begin with pooling.
 VGG_BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-VGG_CHANNELS = (64, 128, 256, 512, 512)
 #: LPIPS's normalisation of an image in -1..1.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)

@@ -7,18 +7,15 @@ Jensen et al., "DTU", CVPR 2014 (accuracy and completeness, restricted to what w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera
-from pipeline.errors import RequestError
+from stages.geometry.mesh import Mesh, distance_figures
 from stages.geometry.similarity import similarity
 
 Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 #: Both surfaces are thinned to a point per cube of this share of the mesh's diagonal, so that no
 #: part counts more for having been seen from nearer or more often.
@@ -27,79 +24,6 @@ SPACING = 1 / 500
 #: does not have, and squares would follow them.
 _TRIM = 2.5
 _ICP_STEPS = 60
-
-
-class Mesh:
-    """A triangle mesh to measure distances to and to cast rays at.
-
-    Attributes:
-        vertices: [V, 3] float64.
-        diagonal: length of the diagonal of its bounding box.
-    """
-
-    def __init__(self, vertices: Array, triangles: npt.NDArray[np.integer]) -> None:
-        """
-        Args:
-            vertices: [V, 3]; triangles: [T, 3] indices of them.
-        """
-        import open3d as o3d
-
-        self.vertices = np.asarray(vertices, np.float64)
-        self.diagonal = float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
-        # single precision is at its best around the origin
-        self.middle = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
-        self.scene = o3d.t.geometry.RaycastingScene()
-        self.scene.add_triangles(
-            _tensor((self.vertices - self.middle).astype(np.float32)),
-            _tensor(np.asarray(triangles).astype(np.uint32)),
-        )
-
-    @classmethod
-    def read(cls, path: Path) -> Mesh:
-        """Read a `.ply`.
-
-        Raises:
-            RequestError: it holds no triangles.
-        """
-        import open3d as o3d
-
-        read = o3d.io.read_triangle_mesh(path)
-        if len(read.triangles) == 0:
-            raise RequestError(f"evaluate.mesh: {path} holds no triangles. Give a mesh as .ply.")
-        return cls(np.asarray(read.vertices), np.asarray(read.triangles))
-
-    def closest(self, points: Array) -> Array:
-        """[N, 3] the points of the surface nearest to points [N, 3]."""
-        local = _tensor((points - self.middle).astype(np.float32))
-        found = self.scene.compute_closest_points(local)["points"].numpy()
-        return np.asarray(found, np.float64) + self.middle
-
-    def distances(self, points: Array) -> Array:
-        """[N] distances of points [N, 3] from the surface."""
-        return np.asarray(np.linalg.norm(points - self.closest(points), axis=1))
-
-    def depth(self, camera: Camera) -> Array:
-        """[H, W] z at which a camera sees the surface at each pixel's centre; 0 where it does not.
-
-        Args:
-            camera: in the world of the mesh.
-        """
-        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-        local = np.stack(
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1
-        )
-        origin = np.broadcast_to(camera.centre - self.middle, local.shape)
-        rays = np.concatenate([origin, local @ camera.rotation], -1).astype(np.float32)
-        hit = self.scene.cast_rays(_tensor(rays))["t_hit"].numpy()
-        return np.where(np.isfinite(hit), hit, 0).astype(np.float64)
-
-
-def _tensor(values: npt.NDArray[Any]) -> Any:
-    """The array as Open3D wants it."""
-    import open3d as o3d
-
-    core: Any = o3d.core  # its stubs lack the arguments' defaults
-    return core.Tensor(np.ascontiguousarray(values))
 
 
 def nearest_distances(points: Array, others: Array) -> Array:
@@ -122,15 +46,6 @@ def f_score(accuracy: Array, completeness: Array, distance: float) -> float:
     """Harmonic mean of the shares of points [N] and of true surface [M] within a distance."""
     precision, recall = float((accuracy < distance).mean()), float((completeness < distance).mean())
     return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
-
-
-def _figures(distances: Array, factor: float) -> dict[str, float]:
-    values = distances * factor
-    return {
-        "median": float(np.median(values)),
-        "mean": float(values.mean()),
-        "p90": float(np.quantile(values, 0.9)),
-    }
 
 
 def surface_figures(
@@ -156,8 +71,8 @@ def surface_figures(
     accuracy = mesh.distances(thinned(points, spacing))
     completeness = nearest_distances(thinned(seen, spacing), surface)
     return {
-        f"accuracy{suffix}": _figures(accuracy, factor),
-        f"completeness{suffix}": _figures(completeness, factor),
+        f"accuracy{suffix}": distance_figures(accuracy * factor),
+        f"completeness{suffix}": distance_figures(completeness * factor),
         "fscore": {
             str(float(distance)): f_score(accuracy * factor, completeness * factor, distance)
             for distance in distances

@@ -92,6 +92,7 @@ def move_gaussians(gaussians: Gaussians, similarity: Array) -> Gaussians:
         logit_opacities=gaussians.logit_opacities,
         sh=sh.astype(np.float32),
         light=_moved_light(gaussians.light, scale, rotation),
+        background=gaussians.background,
     )
 
 

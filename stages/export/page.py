@@ -143,6 +143,7 @@ def build_page(
             "count": len(kept), "sh_degree": degree, "texels": texels(degree), "per_row": PER_ROW,
             "rasterizer": dict(rasterizer), "light": describe_light(light, orbit),
         },
+        "background": list(gaussians.background),
         "orbiting": describe_orbit(orbit),
         "views": views,
         "first": orbit.middle(),

@@ -52,7 +52,9 @@ class Viewer {
       this.wake(false);
     });
     this.background = 0;
-    this.backdrop = BACKGROUNDS[0];
+    const own = scene.background;
+    this.backgrounds = own.some((value) => value > 0) ? [own, ...BACKGROUNDS] : BACKGROUNDS;
+    this.backdrop = this.backgrounds[0];
     this.exact = null;      // a pose set through the hook
     this.view = -1;         // the photograph whose camera this is, or -1
     this.motion = null;     // a running transition
@@ -232,8 +234,8 @@ class Viewer {
   }
 
   nextBackground() {
-    this.background = (this.background + 1) % BACKGROUNDS.length;
-    this.backdrop = BACKGROUNDS[this.background];
+    this.background = (this.background + 1) % this.backgrounds.length;
+    this.backdrop = this.backgrounds[this.background];
     this.wake(false);
   }
 

@@ -240,9 +240,12 @@ class FitConfig(StageConfig):
         "have grown out of them (auto: 0.2; 0 on a held surface, which has a rim and no needles)",
     )
     near: float = number(0.05, "near plane, as a share of the scene's median depth", gt=0)
-    background: tuple[float, float, float] = number(
-        (0.0, 0.0, 0.0), "colour behind everything, sRGB 0..1"
+    background: Auto | tuple[float, float, float] = number(
+        AUTO,
+        "colour behind everything, sRGB 0..1 (auto: found by the fit; black where photographs are "
+        "partly masked out)",
     )
+    background_lr: float = number(1e-2, "learning rate of that colour", ge=0)
     divergence_factor: float = number(
         5.0, "stop where the loss (running mean) exceeds its best by this factor", gt=1
     )

@@ -106,6 +106,10 @@ def fit(
             unpack(harmonics_for_viewers(trainer, scene.cameras).packed),
             light=trainer.light.light(scene.frame.scale),
         )
+    colour = trainer.background.values
+    if colour.any():
+        red, green, blue = (float(value) for value in colour)
+        gaussians = replace(gaussians, background=(red, green, blue))
     poses = trainer.poses.poses
     factor = float(np.exp(trainer.focal.log_factor))
     refined = [

@@ -82,6 +82,7 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         position_lr_final=0.0, rotation_lr=0.0, scaling_lr=0.0, opacity_lr=0.0,
         optimize_poses=False, densify=False, lambda_depth=0.0, lambda_flow=0.0,
         opacity_reset_interval=0, sh_degree_interval=0,
+        background=tuple(trainer.background.values.tolist()),
     )  # fmt: skip
     second = Trainer(
         np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held, trainer.targets,

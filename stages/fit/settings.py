@@ -13,7 +13,8 @@ MANY_VIEWS = 6
 class FitSettings:
     """See `config.FitConfig` for what each field means.
 
-    What depends on the views is not ``"auto"`` any more; `light` may be: a trial decides.
+    What depends on the views is not ``"auto"`` any more; `light` (a trial decides) and `background`
+    (the masks do) may be.
     """
 
     iterations: int
@@ -98,7 +99,8 @@ class FitSettings:
     final_prune_near: float
     final_prune_masked: float
     near: float
-    background: tuple[float, float, float]
+    background: tuple[float, float, float] | str
+    background_lr: float
     seed: int
     divergence_factor: float
     preview_every: int

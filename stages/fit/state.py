@@ -43,6 +43,7 @@ def save_state(trainer: Trainer, path: Path) -> None:
         "psnr": trainer.psnr,
         "best_loss": trainer.best_loss,
         "focal": trainer.focal.state(),
+        "background": trainer.background.state(),
         "progressive": trainer.progressive.state() if trainer.progressive is not None else None,
     }
     save_checkpoint(path, arrays, facts)
@@ -68,6 +69,7 @@ def restore_state(trainer: Trainer, path: Path) -> bool:
     if trainer.held_surface is not None:
         trainer.held_surface.restore(arrays)
     trainer.focal.restore(facts["focal"])
+    trainer.background.restore(facts["background"])
     if trainer.progressive is not None:
         trainer.progressive.restore(facts["progressive"])
     trainer.best_loss = facts["best_loss"]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import ReconstructionError
+from stages.fit.background import Background
 from stages.fit.density import DensityStatistics, choose, grow
 from stages.fit.diary import write_curve, write_preview
 from stages.fit.exposure import Exposure
@@ -80,6 +81,7 @@ class Trainer:
         self.adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
         self.statistics = DensityStatistics.empty(len(packed))
         self.exposure = Exposure(len(poses))
+        self.background = Background(settings, targets)
         self.focal = SharedFocal()
         self.random = np.random.Generator(np.random.PCG64(settings.seed))
         self.queue: list[int] = []
@@ -118,8 +120,8 @@ class Trainer:
         local = np.ascontiguousarray(pose, np.float32)
         intrinsics = self.focal.apply(target.intrinsics)
         rendering = self.look(Viewpoint(local, intrinsics, target.width, target.height))
-        behind = np.asarray(self.settings.background, np.float32)[:, None, None]
-        return np.ascontiguousarray(rendering.planes[:3] + rendering.transmittance * behind)
+        image = self.background.behind(rendering.planes[:3], rendering.transmittance)
+        return np.ascontiguousarray(image)
 
     def render(self, view: int, factor: int = 1) -> Rendering:
         """A view as the Gaussians stand now, colour only."""
@@ -134,10 +136,7 @@ class Trainer:
 
     def composited(self, view: int, rendering: Rendering) -> Floats:
         """[3, H, W] colour over the background, with the view's exposure."""
-        image = rendering.planes[:3]
-        if any(self.settings.background):
-            behind = np.asarray(self.settings.background, np.float32)[:, None, None]
-            image = image + rendering.transmittance * behind
+        image = self.background.behind(rendering.planes[:3], rendering.transmittance)
         if self.settings.exposure:
             image = self.exposure.apply(view, image)
         return np.ascontiguousarray(image)
@@ -230,11 +229,12 @@ class Trainer:
         if s.exposure:
             # the same number of steps for every view, to within one
             steps = 1 + (self.iteration - 1) // len(self.targets)
-            d_image = self.exposure.step(view, rendering.planes[:3], d_image, s.exposure_lr, steps)
+            unexposed = self.background.behind(rendering.planes[:3], rendering.transmittance)
+            d_image = self.exposure.step(view, unexposed, d_image, s.exposure_lr, steps)
         d_planes[:3] = d_image
-        if any(s.background):
-            behind = np.asarray(s.background, np.float32)[:, None, None]
-            d_transmittance += (d_image * behind).sum(0)
+        if self.background.values.any():
+            d_transmittance += (d_image * self.background.colour()).sum(0)
+        self.background.step(d_image, rendering.transmittance)
         with_depth = self._with_depth(target)
         if with_depth:
             loss += 2 * s.lambda_depth * depth_loss(

@@ -84,8 +84,7 @@ def _basis_pullback(x, y, z, degree, g):  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True, error_model="numpy")
 def features_forward(  # type: ignore[no-untyped-def]
     packed: Floats, degree: int, centre: Floats, screen: Floats, next_pose: Floats,
-    intrinsics: Floats, next_intrinsics: Floats, with_depth: int, with_flow: int, near: np.float32,
-    features: Floats,
+    next_intrinsics: Floats, with_depth: int, with_flow: int, near: np.float32, features: Floats,
 ):  # fmt: skip
     """Colour, then depth, then flow of the visible Gaussians.
 
@@ -95,7 +94,6 @@ def features_forward(  # type: ignore[no-untyped-def]
         centre: [3] camera centre in the world.
         screen: [N, 12] projected Gaussians.
         next_pose, next_intrinsics: [3, 4] and [4], the camera that flow leads to.
-        intrinsics: [4] of this camera.
         with_depth, with_flow: 1 to add a depth feature, then two flow features (px).
         near: depth at which the next camera's division is held.
         features: [N, >= 3 + with_depth + 2 with_flow] output; columns after those are left alone,

@@ -214,15 +214,14 @@ class ColourLoss:
         )  # fmt: skip
         loss = (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim)
         psnr = float(-10 * np.log10(max(square, 1e-12)))
-        return ColourLossResult(loss, gradient, psnr, ssim, l1)
+        return ColourLossResult(loss, gradient, psnr, ssim)
 
 
 @dataclass(frozen=True)
 class ColourLossResult:
-    """Attributes: loss; gradient [3, H, W]; psnr in dB; ssim; l1 (means over valid pixels)."""
+    """Attributes: loss; gradient [3, H, W]; psnr in dB; ssim (mean over valid pixels)."""
 
     loss: float
     gradient: Floats
     psnr: float
     ssim: float
-    l1: float

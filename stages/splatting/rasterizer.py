@@ -346,8 +346,8 @@ def _rasterize(
         features[:, own:channels] = given
     following = flow_to or viewpoint
     features_forward(
-        packed, degree, viewpoint.centre, screen, following.pose, viewpoint.intrinsics,
-        following.intrinsics, with_depth, with_flow, near32, features,
+        packed, degree, viewpoint.centre, screen, following.pose, following.intrinsics,
+        with_depth, with_flow, near32, features,
     )  # fmt: skip
     planes = np.empty((features.shape[1], height, width), np.float32)
     transmittance = np.empty((height, width), np.float32)

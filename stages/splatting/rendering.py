@@ -50,7 +50,7 @@ def _as_seen(gaussians: Gaussians, camera: Camera) -> tuple[Floats, int]:
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] | None = None,
     threads: int | None = None,
     near: float | None = None,
 ) -> RenderedView:
@@ -59,7 +59,7 @@ def render(
     Args:
         gaussians: the scene.
         camera: with the size of the picture.
-        background: sRGB colour behind everything.
+        background: sRGB colour behind everything; None: the scene's own.
         threads: how many to use (None: all); never changes the result.
         near: near plane in world units; None: 2 % of the median depth in front of the camera.
     """
@@ -73,7 +73,7 @@ def render(
         near = NEAR_FRACTION * float(np.median(ahead)) if len(ahead) else 1e-6
     result = rasterize(packed, Viewpoint.of(camera), degree=degree, near=near, depth=True)
     alpha = 1 - result.transmittance
-    behind = np.asarray(background, np.float32)
+    behind = np.asarray(gaussians.background if background is None else background, np.float32)
     image = result.planes[:3].transpose(1, 2, 0) + result.transmittance[..., None] * behind
     depth = np.where(alpha > 0, result.planes[3] / np.maximum(alpha, 1e-8), 0)
     return RenderedView(

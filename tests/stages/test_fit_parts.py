@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
+from stages.fit.background import Background
 from stages.fit.config import FitConfig
 from stages.fit.density import rotations
 from stages.fit.initial import Cloud, smooth_normals, thin
@@ -14,6 +15,7 @@ from stages.fit.poses import SharedFocal
 from stages.fit.scene import out_of_place, trusted_points
 from stages.fit.settings import resolve
 from stages.fit.surface import HeldSurface, along_normals, worth_holding
+from stages.fit.targets import make_target
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -190,3 +192,29 @@ def test_what_a_held_surface_changes_unless_the_user_says_otherwise() -> None:
     assert off == free
     chosen = resolve(FitConfig(hold_surface=True, sh_degree=0).model_dump(), 3, 0)
     assert chosen.hold_surface and chosen.sh_degree == 0
+
+
+def test_the_background_is_found_where_nothing_is_masked_out() -> None:
+    camera = Camera("a", 16, 12, 20.0, 20.0, 8.0, 6.0, np.eye(4))
+    image = np.full((12, 16, 3), 0.5, np.float32)
+    whole = make_target(image, np.ones((12, 16), bool), camera, 1, None)
+    masked = make_target(image, np.arange(12)[:, None] < np.full(16, 6), camera, 1, None)
+    settings = resolve(FitConfig(background_lr=0.02).model_dump(), 3, 0)
+    empty, clear = np.zeros((3, 12, 16), np.float32), np.ones((12, 16), np.float32)
+
+    background = Background(settings, [{1: whole}])
+    for _ in range(200):
+        shown = background.behind(empty, clear)
+        background.step(whole.colour(shown, 0.0).gradient, clear)
+    assert background.values == pytest.approx(0.5, abs=0.03)
+    again = Background(settings, [{1: whole}])
+    again.restore(background.state())
+    assert again.state() == background.state()
+
+    black = Background(settings, [{1: whole}, {1: masked}])
+    black.step(whole.colour(empty, 0.0).gradient, clear)
+    assert not black.values.any()
+    given = FitConfig(background=(0.2, 0.3, 0.4)).model_dump()
+    fixed = Background(resolve(given, 3, 0), [{1: whole}])
+    fixed.step(whole.colour(empty, 0.0).gradient, clear)
+    assert fixed.values.tolist() == [0.2, 0.3, 0.4]
