@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,42 @@ def fsync_tree(folder: Path) -> None:
         fsync_folder(Path(parent))
 
 
+def temporary_beside(path: Path) -> Path:
+    """A name of this thread's own beside a file, to write to before it replaces the file.
+
+    What a kill leaves under such a name `remove_leftovers` knows by the process in it.
+    """
+    owner = f"{os.getpid()}.{threading.get_ident()}@{socket.gethostname()}"
+    return path.with_name(f".{path.name}.{owner}.tmp")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed processes of this machine left in a folder and two levels below it."""
+    for pattern in (".*.tmp", "*/.*.tmp", "*/*/.*.tmp"):
+        for path in folder.glob(pattern):
+            owner, _, host = path.name.removesuffix(".tmp").rpartition("@")
+            process = owner.split(".")[-2:-1]
+            if host != socket.gethostname() or not process or not process[0].isdecimal():
+                continue
+            if not _is_running(int(process[0])):
+                path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
+
+
 def write_atomic(path: Path, text: str) -> None:
     """Replace a small text file in one step: a reader sees the old content or the new."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+    temporary = temporary_beside(path)
     try:
-        with temporary.open("w") as stream:
+        with temporary.open("w", encoding="utf-8") as stream:
             stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
@@ -71,7 +103,7 @@ def write_json(path: Path, value: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read JSON, or return None where the file is missing or unreadable as JSON."""
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError, UnicodeDecodeError):
         return None
 

@@ -38,7 +38,9 @@ from pipeline.files import (
     fsync_folder,
     fsync_tree,
     read_json,
+    remove_leftovers,
     sha256_file,
+    temporary_beside,
     write_atomic,
     write_json,
 )
@@ -85,16 +87,17 @@ class Store:
         self._verified: set[tuple[str, str, str]] = set()
 
     def create(self) -> None:
-        """Make the workspace folder.
+        """Make the workspace folder, and clear half-written files of killed runs out of it.
 
         Raises:
             RequestError: it can't be made or written to.
         """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            probe = self.root / f".write-test.{os.getpid()}"
+            probe = temporary_beside(self.root / "write-test")
             probe.write_text("")
             probe.unlink()
+            remove_leftovers(self.root)
         except OSError as error:
             raise RequestError(
                 f"The workspace {self.root} can't be written to ({_reason(error)}). Choose another "
@@ -252,7 +255,7 @@ class Store:
         link = self.root / "results"
         target = os.path.relpath(result.folder / kind, self.root)
         if not (link.is_symlink() and os.readlink(link) == target):  # noqa: PTH115
-            temporary = self.root / f".results.{os.getpid()}"
+            temporary = temporary_beside(link)
             temporary.unlink(missing_ok=True)
             temporary.symlink_to(target)
             temporary.replace(link)

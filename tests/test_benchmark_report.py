@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-from importlib import util
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,9 @@ from pipeline.benchmarking.tables import build_table, paper_note
 from pipeline.report import benchmark_report
 from pipeline.report.benchmark import charts, grid_table, groups
 from stages.evaluate.pictures import comparison
-
-
-def shared(name: str) -> Any:
-    spec = util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-case, report = shared("report_case"), shared("test_report")
+from tests import report_case as case
+from tests.browser import needs_chromium
+from tests.report_page import assert_alone, look, text_of
 
 SUITE = {
     "title": "Ours <b>&",
@@ -93,9 +84,9 @@ def test_tables_failures_pictures(tmp_path: Path) -> None:
     file = benchmark_report(found, tmp_path)
     assert file == tmp_path / "report.html"
     page = file.read_text()
-    report.assert_alone(page)
+    assert_alone(page)
     assert "<i>Rival" not in page and "Ours <b>&" not in page and "<x>" not in page
-    text = report.text_of(page)
+    text = text_of(page)
     for said in (
         "3 of 4 cells done", "The data differ", "Photos <x> and y share too little.", "25.00",
         "23.96", "a, 6 views, <i>Rival</i>", "a, 3 views a photograph held out", "26.00 dB",
@@ -158,18 +149,18 @@ def test_pictures_come_by_scene_most_views_first_and_of_one_seed() -> None:
 
 def test_without_workspaces_and_without_anything_done(tmp_path: Path) -> None:
     page = benchmark_report(results([cell("ours", 3, None)]), tmp_path).read_text()
-    text = report.text_of(page)
+    text = text_of(page)
     assert "0 of 1 cells done" in text
     assert "What failed, and why" in text
     assert "could not be drawn" not in text
 
 
-@report.needs_chromium
+@needs_chromium
 def test_a_browser_draws_it(tmp_path: Path) -> None:
     found = results(cells_of_two_methods())
     for record in found["cells"]:
         if record["status"] == "done":
             write_pictures(tmp_path, record)
-    seen = report.look(benchmark_report(found, tmp_path), tmp_path)
+    seen = look(benchmark_report(found, tmp_path), tmp_path)
     assert seen["wide"]["images"] == 5
     assert len(seen["phone"]["charts"]) == 4

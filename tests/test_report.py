@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
-import shutil
-import subprocess
-from importlib import util
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -24,35 +19,13 @@ from pipeline.report.tables import views_table
 from pipeline.runner import RunSummary
 from stages.evaluate.pictures import comparison
 from stages.geometry.world import move_camera
-
-_spec = util.spec_from_file_location("report_case", Path(__file__).with_name("report_case.py"))
-assert _spec and _spec.loader
-case = util.module_from_spec(_spec)
-_spec.loader.exec_module(case)
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
-
-
-def text_of(page: str) -> str:
-    """What a reader sees: without pictures, styles and tags."""
-    page = re.sub(r"<(style|script|svg)\b.*?</\1>", " ", page, flags=re.S)
-    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", " ", page)))
+from tests import report_case as case
+from tests.browser import browse, needs_chromium
+from tests.report_page import assert_alone, look, text_of
 
 
 def sections_of(page: str) -> list[str]:
     return re.findall(r"<summary>([\w -]+?) ?<", page)
-
-
-def assert_alone(page: str) -> None:
-    """Nothing in the page leads to a file or an address that a browser would fetch."""
-    outside = re.findall(
-        r"<(?:script|link|img|iframe|source)[^>]*(?:src|href)=[\"'](?!data:)", page
-    )
-    assert outside == []
-    assert not re.search(r"url\((?!#|\"?data:)", page)
-    assert "@import" not in page
-    assert "default-src 'none'" in page
 
 
 def test_everything_that_is_there_is_shown(tmp_path: Path) -> None:
@@ -198,77 +171,6 @@ def test_columns_without_figures_are_left_out() -> None:
 
 # -- in a browser ----------------------------------------------------------------------------------
 
-PROBE = """<!doctype html><title>probe</title><body>
-<iframe id="wide" style="width: 1200px; height: 900px" srcdoc="PAGE"></iframe>
-<iframe id="phone" style="width: 390px; height: 800px" srcdoc="PAGE"></iframe>
-<script>
-onload = async () => {
-  const result = {};
-  for (const id of ["wide", "phone"]) {
-    const page = document.getElementById(id).contentDocument;
-    for (const entry of page.querySelectorAll("details")) entry.open = true;
-    await new Promise((done) => setTimeout(done, 300));
-    const images = [...page.images].filter((image) => !image.closest("dialog"));
-    const root = page.documentElement;
-    result[id] = {
-      images: images.length,
-      blank: images.filter((image) => !image.naturalWidth).map((image) => image.alt),
-      charts: [...page.querySelectorAll("svg.chart")].map((chart) => {
-        const box = chart.getBBox();
-        return [box.width, box.height, chart.getBoundingClientRect().width];
-      }),
-      overflow: root.scrollWidth - root.clientWidth,
-      requests: performance.getEntriesByType("resource").map((entry) => entry.name)
-        .concat(page.defaultView.performance.getEntriesByType("resource").map((e) => e.name))
-        .filter((name) => !name.startsWith("data:")),
-    };
-  }
-  const page = document.getElementById("wide").contentDocument;
-  const slider = page.querySelector(".compare input");
-  if (slider) {
-    slider.value = 20;
-    slider.dispatchEvent(new Event("input"));
-    result.at = page.querySelector(".compare").style.getPropertyValue("--at");
-    page.querySelector("img.zoom").click();
-    result.zoomed = page.querySelector("dialog").open;
-    const table = page.querySelector("table.sort");
-    table.querySelectorAll("th button")[1].click();
-    result.sorted = [...table.tBodies[0].rows].map((row) => Number(row.cells[1].dataset.v));
-  }
-  const text = document.createElement("pre");
-  text.id = "result";
-  text.textContent = JSON.stringify(result);
-  document.body.append(text);
-};
-</script></body>"""
-
-
-def look(page: Path, folder: Path) -> dict[str, Any]:
-    """Open a report at two widths in headless Chromium; what was drawn, and nothing complained."""
-    assert CHROMIUM
-    file = folder / "probe.html"
-    file.write_text(PROBE.replace("PAGE", html.escape(page.read_text())))
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-        "--no-first-run", "--disable-background-networking", "--disable-component-update",
-        "--disable-sync", "--window-size=1300,1000", "--virtual-time-budget=4000",
-        f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--v=0", "--dump-dom",
-        f"file://{file}",
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    complaints = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    assert complaints == []
-    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.S)
-    assert found, done.stderr[-2000:]
-    result: dict[str, Any] = json.loads(html.unescape(found[1]))
-    for width in ("wide", "phone"):
-        seen = result[width]
-        assert seen["blank"] == []
-        assert seen["overflow"] <= 0
-        assert seen["requests"] == []
-        assert all(w > 100 and h > 100 and shown > 100 for w, h, shown in seen["charts"])
-    return result
-
 
 @needs_chromium
 def test_a_browser_draws_every_figure_of_a_real_run(sample_run: RunSummary, tmp_path: Path) -> None:
@@ -286,12 +188,7 @@ def test_a_browser_draws_every_figure_of_a_real_run(sample_run: RunSummary, tmp_
     assert seen["zoomed"] is True
     assert len(seen["sorted"]) >= 3
     shot = tmp_path / "shot.png"
-    subprocess.run(
-        [CHROMIUM or "", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
-         "--window-size=1200,1600", f"--user-data-dir={tmp_path / 'second'}",
-         f"--screenshot={shot}", f"file://{page}"],
-        capture_output=True, timeout=120, check=True,
-    )  # fmt: skip
+    browse(page, tmp_path, (1200, 1600), f"--screenshot={shot}")
     drawn = cv2.imread(str(shot))
     assert drawn.shape == (1600, 1200, 3)
     assert drawn[400:].reshape(-1, 3).std(0).min() > 20, "pictures, not a blank page"

@@ -80,8 +80,16 @@ def benchmark(
         results = _results(loaded, cells, tables, records, machine(jobs, threads))
         write_json(place / "results.json", results)
         write_tables(results, place)
-        benchmark_report(results, place)
+        _write_report(results, place, say or (lambda text: None))
     return results
+
+
+def _write_report(results: dict[str, Any], out: Path, say: Say) -> None:
+    """Write the report; whatever goes wrong with it is said, and harms nothing else."""
+    try:
+        benchmark_report(results, out)
+    except Exception as error:
+        say(f"The report could not be written: {error}")
 
 
 @contextlib.contextmanager

@@ -150,7 +150,7 @@ def read_case(workspace: Path) -> Case:
         order = list(config.run.stages) if config else []
         names.sort(key=lambda name: (order.index(name) if name in order else len(order), name))
         found = [StageStatus(name, "unknown") for name in names]
-    readers = _readers(found, store, request)
+    readers = _readers(found, store)
     records = []
     broken = False
     for entry in [*readers, *found]:
@@ -177,7 +177,7 @@ def _result(store: Store, entry: StageStatus) -> Result | None:
     return store.current(entry.name)
 
 
-def _readers(found: list[StageStatus], store: Store, request: dict[str, Any]) -> list[StageStatus]:
+def _readers(found: list[StageStatus], store: Store) -> list[StageStatus]:
     """Stages whose results were taken as they were (`status` leaves them out)."""
     named = {entry.name for entry in found}
     needed = {

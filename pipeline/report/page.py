@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
-import threading
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import RequestError
+from pipeline.files import write_atomic
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -64,11 +63,8 @@ def write_page(template: str, out: Path, **content: Any) -> Path:
         RequestError: the folder can't be written to.
     """
     text = environment().get_template(template).render(**content)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.{threading.get_ident()}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(out)
+        write_atomic(out, text)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise RequestError(f"The report {out} can't be written ({error.strerror}).") from error
     return out

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from pipeline.planning import library_version
-from pipeline.report import REPORT, scored, sections
+from pipeline.report import REPORT, compared, scored, sections
 from pipeline.report.case import Case, held_out_blocks, read_case, read_metrics
 from pipeline.report.names import labels_of
 from pipeline.report.page import number, seconds, write_page
@@ -54,6 +54,7 @@ def write_run_report(workspace: Path) -> Path:
         "held_out": drawn("held-out views", _held_out, None),
         "support": drawn("support", scored.support, []),
         "scores": drawn("scores", scored.scores, []),
+        "comparison_with_colmap": drawn("comparison", compared.comparison, None),
         "hero": drawn("preview", sections.hero, None),
         "failure_pictures": drawn("failure", sections.failure_pictures, []),
         "poses": block_table(metrics["poses"], POSES, "") if metrics.get("poses") else None,

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
 from stages.comparison.poses import Motion
+from stages.geometry.mesh import Mesh, distance_figures
 from stages.geometry.similarity import similarity
 
 Array = npt.NDArray[np.float64]
@@ -32,18 +33,16 @@ class Surface:
     """A true surface, and the views that show it.
 
     Attributes:
-        scene: `open3d.t.geometry.RaycastingScene` of the mesh.
+        mesh: the surface.
         samples: [S, 3] points on it that at least two views see.
-        extent: diagonal of its bounding box.
         cameras: the true cameras.
         depths: [H, W] z-depth of the mesh in each, 0 beside it.
     """
 
-    scene: Any
+    mesh: Mesh
     samples: Array
-    extent: float
     cameras: tuple[Camera, ...]
-    depths: tuple[npt.NDArray[np.float32], ...]
+    depths: tuple[Array, ...]
 
 
 def read_surface(path: Path, cameras: Sequence[Camera]) -> Surface:
@@ -52,53 +51,27 @@ def read_surface(path: Path, cameras: Sequence[Camera]) -> Surface:
     Raises:
         RequestError: it can't be read, has no triangles, or fewer than two of the cameras see it.
     """
-    import open3d
-
-    path = path.expanduser()
-    mesh = open3d.io.read_triangle_mesh(path) if path.is_file() else None
-    if mesh is None or not mesh.has_triangles():
-        raise RequestError(f"--mesh: {path} holds no triangle mesh. Give a .ply, .stl or .obj.")
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
-    seen = [depth_of(scene, camera) for camera in cameras]
+    mesh = Mesh.read(path, "--mesh")
+    seen = [mesh.depth(camera) for camera in cameras]
     points = [
         camera.unproject(depth)[depth > 0] for camera, depth in zip(cameras, seen, strict=True)
     ]
     stacked = np.concatenate(points) if points else np.zeros((0, 3))
-    extent = float(np.linalg.norm(mesh.get_max_bound() - mesh.get_min_bound()))
     count = np.zeros(len(stacked))
     for camera, depth in zip(cameras, seen, strict=True):
         there = _looked_up(depth, camera, stacked)
         away = camera.project(stacked)[1]
-        count += (there > 0) & (np.abs(there - away) < 0.005 * extent)
+        count += (there > 0) & (np.abs(there - away) < 0.005 * mesh.diagonal)
     twice = stacked[count >= 2]
     if len(twice) == 0:
         raise RequestError(
             f"--mesh: no part of {path} is seen by two of the true cameras. Is it in the frame of "
             "--ground-truth?"
         )
-    return Surface(scene, drawn(twice), extent, tuple(cameras), tuple(seen))
+    return Surface(mesh, drawn(twice), tuple(cameras), tuple(seen))
 
 
-def depth_of(scene: Any, camera: Camera) -> npt.NDArray[np.float32]:
-    """[H, W] z-depth of a mesh as a camera sees it, 0 where it doesn't."""
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    local = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1
-    )
-    origin = np.broadcast_to(camera.centre, local.shape)
-    rays = np.concatenate([origin, local @ camera.rotation], -1).astype(np.float32)
-    distance = scene.cast_rays(_tensor(rays))["t_hit"].numpy()  # in units of the ray's z
-    return np.where(np.isfinite(distance), distance, np.float32(0))
-
-
-def _tensor(values: Array | npt.NDArray[np.float32]) -> Any:
-    import open3d
-
-    return open3d.core.Tensor.from_numpy(np.ascontiguousarray(values, np.float32))
-
-
-def _looked_up(depth: npt.NDArray[np.float32], camera: Camera, points: Array) -> Array:
+def _looked_up(depth: Array, camera: Camera, points: Array) -> Array:
     """[N] depth map's value where points [N, 3] project to, 0 outside."""
     pixels, away = camera.project(points)
     column, row = np.floor(np.clip(pixels, -1, 1e6)).astype(np.int64).T
@@ -142,13 +115,13 @@ def against_surface(points: Array, motion: Motion, surface: Surface) -> dict[str
     for _ in range(ROUNDS):
         step = _towards(sample, surface)
         sample, chosen = moved_by(sample, step), moved_by(chosen, step)
-    distance = _nearest(surface.scene, sample)[1]
+    distance = surface.mesh.distances(sample)
     covered = cKDTree(chosen).query(surface.samples)[0]
-    near = NEAR * surface.extent
+    near = NEAR * surface.mesh.diagonal
     return {
         "points_on_mesh": len(chosen),
-        "accuracy": _figures(distance),
-        "completeness": _figures(covered),
+        "accuracy": distance_figures(distance),
+        "completeness": distance_figures(covered),
         "covered_percent": 100 * float((covered < near).mean()),
         "covered_within": near,
     }
@@ -159,19 +132,14 @@ def _towards(points: Array, surface: Surface) -> Motion:
 
     By the way from the points to the surface alone, a free scale would shrink them into a patch.
     """
-    nearest, away = _nearest(surface.scene, points)
+    nearest = surface.mesh.closest(points)
+    away = np.linalg.norm(nearest - points, axis=1)
     back, index = cKDTree(points).query(surface.samples)
     close, covered = away <= np.quantile(away, KEPT), back <= np.quantile(back, KEPT)
     source = np.concatenate([points[close], points[index[covered]]])
     target = np.concatenate([nearest[close], surface.samples[covered]])
     share = [np.full(int(k.sum()), 1 / k.sum()) for k in (close, covered)]
     return similarity(source, target, np.concatenate(share))
-
-
-def _nearest(scene: Any, points: Array) -> tuple[Array, Array]:
-    tensor = _tensor(points)
-    found = scene.compute_closest_points(tensor)["points"].numpy().astype(np.float64)
-    return found, np.linalg.norm(found - points, axis=1)
 
 
 def against_cloud(points: Array, motion: Motion, other: Array, extent: float) -> dict[str, Any]:
@@ -189,8 +157,8 @@ def against_cloud(points: Array, motion: Motion, other: Array, extent: float) ->
     towards = cKDTree(other).query(moved)[0]
     back = cKDTree(moved_by(points, motion)).query(drawn(other))[0]
     return {
-        "to_other_percent": _figures(100 * towards / extent),
-        "from_other_percent": _figures(100 * back / extent),
+        "to_other_percent": distance_figures(100 * towards / extent),
+        "from_other_percent": distance_figures(100 * back / extent),
     }
 
 
@@ -206,11 +174,3 @@ def robust_extent(points: Array) -> float:
         return 0.0
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     return float(np.linalg.norm(high - low))
-
-
-def _figures(values: Array) -> dict[str, float]:
-    return {
-        "median": float(np.median(values)),
-        "mean": float(values.mean()),
-        "p90": float(np.quantile(values, 0.9)),
-    }

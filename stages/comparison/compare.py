@@ -13,6 +13,8 @@ from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.files import read_json, write_atomic, write_json
 from pipeline.progress import Reporter
+from pipeline.report import REPORT, run_report
+from pipeline.report.compared import FILE, FOLDER
 from pipeline.store import CorruptResultError, Result, Store
 from stages.comparison import clouds, evidence, poses
 from stages.comparison.colmap_run import SETTINGS, photo_names, run_on_views, thresholds
@@ -105,7 +107,7 @@ def compare(
     if ground_truth is not None:
         truth, units = read_truth(Path(ground_truth), views)
     surface = clouds.read_surface(Path(mesh), list(truth.values())) if mesh else None
-    folder = home / "compare"
+    folder = home / FOLDER
     folder.mkdir(exist_ok=True)
 
     ours = _entries_of(store)
@@ -128,6 +130,7 @@ def compare(
             entry.row["errors"] = poses.score(entry.cameras, reference, entry.distance, units)
     figures: dict[str, Any] = {
         "workspace": str(home),
+        "results": {name: used.key for name in STAGES if (used := store.current(name))},
         "views": [view.name for view in views],
         "reference": "ground truth" if truth else best.name if best else None,
         "units": units,
@@ -142,9 +145,16 @@ def compare(
             threads=threads, reporter=reporter, message=reporter.message,
         )  # fmt: skip
         figures["fits_from"] = best.name if best else None
-    write_json(folder / "comparison.json", figures)
-    write_atomic(folder / "comparison.md", markdown(tables_of(figures)))
-    write_report(folder / "report.html", figures, _series(entries, best, truth))
+    tables = tables_of(figures)
+    figures["tables"] = [table.described() for table in tables]
+    write_json(folder / FILE, figures)
+    write_atomic(folder / "comparison.md", markdown(tables))
+    write_report(folder / REPORT, figures, _series(entries, best, truth))
+    if (home / REPORT).exists():  # it shows these tables
+        try:
+            run_report(home)
+        except Exception as error:
+            reporter.message(f"The report {home / REPORT} could not be renewed: {error}")
     return Comparison(folder, figures)
 
 

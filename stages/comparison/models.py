@@ -25,14 +25,12 @@ class Model:
     Attributes:
         folder: of its files.
         cameras: view name -> pinhole camera at working size, in the model's world.
-        image_of_view: view name -> name of its image in the model.
         points: the sparse points.
         sizes: registered images of each model of the run, largest first.
     """
 
     folder: Path
     cameras: dict[str, Camera]
-    image_of_view: dict[str, str]
     points: ModelPoints
     sizes: tuple[int, ...]
 
@@ -84,7 +82,6 @@ def read_largest(path: Path, views: Sequence[View], setting: str = "--colmap") -
         cameras={
             v.name: pinhole_camera(v, known[v.name], setting) for v in views if v.name in known
         },
-        image_of_view={name: camera.name for name, camera in known.items()},
         points=points,
         sizes=sizes,
     )

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.report.compared import compared_table
 from pipeline.report.figures import Chart, camera_plot, match_matrix
 from pipeline.report.geometry import Similarity
 from pipeline.report.page import write_page
-from pipeline.report.tables import Cell
-from pipeline.report.tables import Table as PageTable
 from stages.comparison.poses import Motion
-from stages.comparison.tables import Table, tables_of
 
 
 def write_report(
@@ -26,31 +24,16 @@ def write_report(
     """Write the page.
 
     Args:
-        figures: of the comparison.
+        figures: what comparison.json says.
         cameras: title, cameras and what brings them into the world of the last ones.
     """
     write_page(
         "compare.html", out,
         title=Path(figures["workspace"]).resolve().name,
         figures=figures,
-        tables=[(table, _for_page(table)) for table in tables_of(figures)],
+        tables=[compared_table(described) for described in figures["tables"]],
         charts=_charts(figures, cameras),
     )  # fmt: skip
-
-
-def _for_page(table: Table) -> PageTable:
-    rows = [
-        [Cell(text, None if k == 0 else _value(text)) for k, text in enumerate(row)]
-        for row in table.rows
-    ]
-    return PageTable(table.head, rows)
-
-
-def _value(text: str) -> float | None:
-    try:
-        return float(text.split(" / ")[0].replace(",", ""))
-    except ValueError:
-        return None
 
 
 def _charts(

@@ -27,6 +27,13 @@ class Table:
     rows: Sequence[Sequence[str]]
     notes: Sequence[tuple[str, str]] = ()
 
+    def described(self) -> dict[str, Any]:
+        """The table for JSON."""
+        return {
+            "title": self.title, "explanation": self.explanation, "head": list(self.head),
+            "rows": [list(row) for row in self.rows], "notes": [list(note) for note in self.notes],
+        }  # fmt: skip
+
 
 def tables_of(figures: Mapping[str, Any]) -> list[Table]:
     """All tables of a comparison's figures."""

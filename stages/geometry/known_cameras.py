@@ -167,6 +167,9 @@ def matching_cameras(
 ) -> dict[str, KnownCamera]:
     """Name of a view -> its camera: by the name of the source file, with or without suffix.
 
+    Models that we exported have the names of views. Of all these ways the one that finds most
+    cameras holds, so that photographs 000, 005, 010 are not taken for views of these names.
+
     Args:
         cameras: of the model.
         views: with names of their own.
@@ -182,23 +185,25 @@ def matching_cameras(
         (lambda view: PurePath(view.source_name).stem, lambda name: PurePath(name).stem),
         (lambda view: view.name, lambda name: PurePath(name).stem),  # a model that we exported
     )
-    found: dict[str, KnownCamera] = {}
+    best: dict[str, list[KnownCamera]] = {}
     for name_of_view, name_of_camera in schemes:
         fitting = {
             view.name: [c for c in cameras if name_of_camera(c.name) == name_of_view(view)]
             for view in views
             if name_of_view(view)
         }
-        found = {name: those[0] for name, those in fitting.items() if those}
-        several = next((name for name, those in fitting.items() if len(those) > 1), None)
-        if several is not None:
-            raise RequestError(
-                f"{setting}: {len(fitting[several])} cameras fit one photograph "
-                f"({', '.join(camera.name for camera in fitting[several][:3])}). Give each image a "
-                "name of its own."
-            )
-        if len(found) >= 2:
-            return found
+        found = {name: those for name, those in fitting.items() if those}
+        if len(found) > len(best):
+            best = found
+    several = next((those for those in best.values() if len(those) > 1), None)
+    if several is not None:
+        raise RequestError(
+            f"{setting}: {len(several)} cameras fit one photograph "
+            f"({', '.join(camera.name for camera in several[:3])}). Give each image a name of its "
+            "own."
+        )
+    if len(best) >= 2:
+        return {name: those[0] for name, those in best.items()}
     raise RequestError(
         f"{setting}: fewer than two of the {len(views)} photographs have a camera in the model. "
         f"The names there are like {cameras[0].name}, the photographs' like "

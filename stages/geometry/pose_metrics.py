@@ -39,11 +39,6 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def ate(estimated: Array, truth: Array) -> float:
-    """Absolute trajectory error: root mean square of `position_errors` (aligned poses)."""
-    return root_mean_square(position_errors(estimated, truth))
-
-
 def rpe(estimated: Array, truth: Array) -> tuple[float, float]:
     """Relative pose error between each camera and the next, root mean square.
 

@@ -17,12 +17,10 @@ class Reduction:
     Attributes:
         cloud: the reduced points; well-known ones first, then the fill.
         fill: how many of them are fill, at the end.
-        voxel: edge of the voxels for well-known points, world units; 0 if none were merged.
     """
 
     cloud: Cloud
     fill: int
-    voxel: float
 
 
 def reduce_cloud(
@@ -69,7 +67,7 @@ def reduce_cloud(
             for name in ("positions", "colors", "normals", "confidence")
         )
     )
-    return Reduction(joined, len(fill), voxel)
+    return Reduction(joined, len(fill))
 
 
 def _thin(cloud: Cloud, size: float, budget: int, spacing: float) -> tuple[Cloud, float]:

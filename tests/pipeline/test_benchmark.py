@@ -324,3 +324,19 @@ def workers(folder: Path) -> list[str]:
         if "toy_bench.py" in text and "worker" in text and here:
             found.append(text)
     return found
+
+
+def test_a_fault_of_the_report_is_a_message(
+    bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(results: dict[str, Any], out: Path) -> Path:
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr("pipeline.benchmarking.running.benchmark_report", broken)
+    lines: list[str] = []
+    results = bench(say=lines.append)
+    assert lines[-1] == "The report could not be written: oops"
+    assert results["problems"] == []
+    out = tmp_path / "out"
+    assert json.loads((out / "results.json").read_text()) == results
+    assert (out / "tables.md").exists() and not (out / "report.html").exists()

@@ -18,14 +18,14 @@ from test_runner import artifact_bytes
 TOY = Path(__file__).parent / "toy.py"
 
 
-def command(folder: Path, *arguments: str) -> list[str]:
-    """The command line of a toy pipeline in `folder`, whose preset and images are there."""
+def command(*arguments: str) -> list[str]:
+    """The command line of a toy pipeline, for the folder that its preset and images are in."""
     return [sys.executable, str(TOY), *arguments]
 
 
 def call(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        command(folder, *arguments), cwd=folder, capture_output=True, text=True, timeout=60
+        command(*arguments), cwd=folder, capture_output=True, text=True, timeout=60
     )
 
 
@@ -128,7 +128,7 @@ def test_interrupt_is_resumable(toys: Path) -> None:
     slow = (*RUN, "--set", "count.step_seconds=0.05")
     # Started in the background, a test run ignores interrupts, and so would its children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    process = subprocess.Popen(command(toys, *slow), cwd=toys, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command(*slow), cwd=toys, stderr=subprocess.PIPE, text=True)
     signal.signal(signal.SIGINT, before)
     wait_for_checkpoint(toys / "w")
     process.send_signal(signal.SIGINT)
@@ -153,7 +153,7 @@ def test_kill_at_any_moment_changes_no_byte(toys: Path) -> None:
     killed = 0
     while killed < 8:
         process = subprocess.Popen(
-            command(toys, *slow), cwd=toys, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command(*slow), cwd=toys, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         try:
             process.wait(timeout=moments.uniform(0.1, 0.9))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.artifacts.metrics import Metrics
-from pipeline.files import canonical_json, content_hash, folder_listing, read_json, write_json
+from pipeline.files import (
+    canonical_json,
+    content_hash,
+    folder_listing,
+    read_json,
+    temporary_beside,
+    write_json,
+)
 from pipeline.store import Result, Store
 
 KEY = "a" * 64
@@ -119,3 +129,27 @@ VALUES = st.recursive(
 def test_canonical_json_does_not_depend_on_the_order_of_keys(tree: dict[str, Any]) -> None:
     backwards = dict(reversed(list(tree.items())))
     assert canonical_json(tree) == canonical_json(backwards)
+
+
+def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:
+    """Killed while it wrote the report, the pointer of a stage and a manifest."""
+    killed = (
+        "import os, pathlib, sys\n"
+        "from pipeline.files import write_atomic\n"
+        "pathlib.Path.replace = lambda *_: os._exit(9)\n"
+        "write_atomic(pathlib.Path(sys.argv[1]), 'half')\n"
+    )
+    places = [tmp_path / "report.html", tmp_path / "fit" / "current.json",
+              tmp_path / "fit" / KEY[:12] / "manifest.json"]  # fmt: skip
+    put(Store(tmp_path), 1)
+    for place in places:
+        subprocess.run([sys.executable, "-c", killed, str(place)], check=False, cwd=Path.cwd())
+    assert len(list(tmp_path.rglob("*.tmp"))) == 3
+    own = temporary_beside(tmp_path / "report.html")
+    elsewhere = own.with_name(own.name.replace(".tmp", "-of-another-machine.tmp"))
+    foreign = tmp_path / "fit" / ".notes.tmp"
+    for kept in (own, elsewhere, foreign):
+        kept.write_text(str(os.getpid()))
+    Store(tmp_path).create()
+    assert sorted(tmp_path.rglob("*.tmp")) == sorted((own, elsewhere, foreign))
+    assert value_of(Store(tmp_path)) == 1

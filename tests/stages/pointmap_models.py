@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field, replace
-from importlib import util
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -18,11 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-
-_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
-assert _spec is not None and _spec.loader is not None
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import dense_scene as scene
 
 
 @dataclass

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import util
 from itertools import permutations
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,11 +18,7 @@ from stages.align.optimise import AlignOptions, optimise
 from stages.align.stage import AlignConfig, AlignStage
 from stages.geometry.depths import view_depths
 from stages.geometry.start import start_from_tree
-
-_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
-assert _spec is not None and _spec.loader is not None
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import dense_scene as scene
 
 SIZE = (320, 240)
 

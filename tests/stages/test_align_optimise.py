@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import util
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,11 +19,7 @@ from stages.align.stage import AlignConfig, AlignStage
 from stages.geometry.similarity import refined_pose
 from stages.geometry.start import Start, start_from_cameras, start_from_tree
 from stages.geometry.world import move_camera, similarity_between
-
-_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
-assert _spec is not None and _spec.loader is not None
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import dense_scene as scene
 
 ANGLES = (-24.0, -10.0, 4.0, 18.0)
 EVERY_PAIR = tuple(permutations(range(4), 2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import util
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,7 @@ from stages.align.fusion import FusionOptions, fuse
 from stages.align.stage import AlignConfig, AlignStage
 from stages.geometry.depths import view_depths
 from stages.geometry.start import start_from_cameras, start_from_tree
-
-_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
-assert _spec is not None and _spec.loader is not None
-_scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(_scene)
+from tests.stages import dense_scene as _scene
 
 ANGLES = (-24.0, -8.0, 6.0, 21.0)
 SIZES = ((128, 96), (120, 96), (128, 96), (96, 80))

@@ -1,7 +1,6 @@
 """Parts of the comparison with COLMAP: models, databases, runs, poses, clouds."""
 
 import sqlite3
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +9,6 @@ import numpy as np
 import open3d
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
-
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from stages.comparison import clouds, evidence, poses
@@ -20,6 +16,7 @@ from stages.comparison.colmap_run import SETTINGS, Job, as_stored, run_job, run_
 from stages.comparison.models import read_largest
 from stages.geometry.model_points import as_points, read_model_points
 from stages.views.orientation import make_upright, upright_from_stored
+from tests.stages.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 
 IDENTITY = (1.0, np.eye(3), np.zeros(3))
 

@@ -3,13 +3,9 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from comparison_scene import SAMPLES, moved, true_cameras, true_points, write_model
 
 import pipeline
 from pipeline.artifacts.cameras import Cameras
@@ -18,12 +14,16 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
+from pipeline.store import Store
 from stages.align.stage import AlignStage
 from stages.comparison.compare import compare
 from stages.comparison.tables import markdown, tables_of
 from stages.init.config import InitConfig
 from stages.init.stage import InitStage
 from stages.swap.stage import SwapConfig, SwapStage
+from tests import report_case as case
+from tests.report_page import text_of
+from tests.stages.comparison_scene import SAMPLES, moved, true_cameras, true_points, write_model
 
 SETTINGS = {
     "views.long_side": 192, "init.cameras": str(SAMPLES / "transforms.json"), "fit.iterations": 20,
@@ -49,6 +49,7 @@ def model(tmp_path_factory):
 
 
 def test_the_whole_comparison(workspace, model):
+    pipeline.run_report(workspace)
     found = compare(workspace, colmap=model, ground_truth=SAMPLES / "transforms.json", threads=2)
     rows = {row["name"]: row for row in found.figures["cameras"]}
     assert list(rows) == ["init (ours)", "align (ours)", "fit (ours)", "COLMAP, given model"]
@@ -71,6 +72,29 @@ def test_the_whole_comparison(workspace, model):
     assert "| COLMAP's cameras and points | 3 | 20 |" in text
     page = (found.folder / "report.html").read_text()
     assert page.count("<table") == 3 and "<svg" in page
+    report = text_of((workspace / "report.html").read_text())
+    assert "Comparison with COLMAP measured against ground truth" in report
+    assert "COLMAP, given model 3/3 1 (3)" in report
+    assert "COLMAP's cameras and points 3 20" in report
+    assert "it tells of earlier results" not in report
+
+
+def test_the_report_says_when_a_comparison_is_of_earlier_results(tmp_path):
+    home = case.write_case(tmp_path / "w", ("views", "init", "sap", "fit"))
+    used = Store(home).current("init")
+    table = {
+        "title": "Cameras", "explanation": "Errors.", "head": ["cameras", "s"],
+        "rows": [["<b>ours", "1.5"]], "notes": [["<b>ours", "why & how"]],
+    }  # fmt: skip
+    figures = {"reference": None, "results": {"init": used.key, "fit": "0" * 64}, "tables": [table]}
+    (home / "compare").mkdir()
+    (home / "compare" / "comparison.json").write_text(json.dumps(figures))
+    page = pipeline.run_report(home).read_text()
+    text = text_of(page)
+    assert "Made before fit was computed anew: it tells of earlier results." in text
+    assert "Errors. cameras s <b>ours 1.5 <b>ours why & how" in text
+    assert "<b>ours" not in page
+    assert "could not be drawn" not in text
 
 
 def test_a_rival_that_fails_says_why_and_the_rest_goes_on(workspace, tmp_path):

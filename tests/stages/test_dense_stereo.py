@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import util
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,7 @@ from stages.init.dense.polish import polish, source_maps
 from stages.init.dense.sgbm import sgbm_depth
 from stages.init.dense.sources import inverse_depth_range, scene_points, select_sources
 from stages.init.dense.sweep import stack_sources
-
-_spec = util.spec_from_file_location("dense_scene", Path(__file__).with_name("dense_scene.py"))
-assert _spec is not None and _spec.loader is not None
-_scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(_scene)
-camera, render, scene = _scene.camera, _scene.render, _scene.scene
+from tests.stages.dense_scene import camera, render, scene
 
 # On so small an image depth changes four times as fast from pixel to pixel: smaller penalties.
 OPTIONS = DenseOptions(planes=48, max_planes=48, speckle=10, p1=0.02, p2=0.5)
@@ -37,7 +31,7 @@ def relative_error(found: DenseView, truth: np.ndarray) -> np.ndarray:
 
 
 def same(a: list[DenseView], b: list[DenseView]) -> bool:
-    fields = ("depth", "confidence", "normal", "filled", "agreeing")
+    fields = ("depth", "confidence", "normal", "filled")
     return all(
         getattr(x, name).tobytes() == getattr(y, name).tobytes()
         for x, y in zip(a, b, strict=True)

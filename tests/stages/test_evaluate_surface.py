@@ -13,7 +13,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
 from stages.evaluate.geometry import geometry_figures
 from stages.evaluate.held_out import register
-from stages.evaluate.perceptual import VGG_BLOCKS, VGG_CHANNELS, Lpips, find_vgg_weights, flip_map
+from stages.evaluate.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights, flip_map
 from stages.evaluate.support import (
     TINT,
     SeenSurface,
@@ -24,7 +24,8 @@ from stages.evaluate.support import (
     supporting_views,
     unsupported_share,
 )
-from stages.evaluate.surface import Mesh, f_score, icp, nearest_distances, surface_figures, thinned
+from stages.evaluate.surface import f_score, icp, nearest_distances, surface_figures, thinned
+from stages.geometry.mesh import Mesh
 from stages.geometry.rigid import exponential
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
@@ -226,7 +227,7 @@ def random_vgg(seed: int) -> dict[str, Any]:
 
     made = torch.Generator().manual_seed(seed)
     state, inputs = {}, 3
-    for block, channels in zip(VGG_BLOCKS, VGG_CHANNELS, strict=True):
+    for block, channels in zip(VGG_BLOCKS, (64, 128, 256, 512, 512), strict=True):
         for index in block:
             size = (channels, inputs, 3, 3)
             scale = (2 / (9 * inputs)) ** 0.5

@@ -1,8 +1,5 @@
 """Similarities, the cameras' arrangement, and paths between them."""
 
-from importlib import util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,11 +15,7 @@ from stages.export.frame import (
 )
 from stages.export.orbits import between, central_depth, find_orbit, look_at, there_and_back
 from stages.splatting.rendering import render
-
-_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
-assert _spec and _spec.loader
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import export_scene as scene
 
 
 def similarity(scale: float = 23.0) -> np.ndarray:

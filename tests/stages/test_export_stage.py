@@ -3,7 +3,6 @@
 import hashlib
 import json
 from dataclasses import replace
-from importlib import util
 from pathlib import Path
 
 import av
@@ -19,11 +18,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
 from stages.export.frame import move_cameras
 from stages.export.stage import ExportConfig, ExportStage
-
-_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
-assert _spec and _spec.loader
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import export_scene as scene
 
 #: our world -> the input's millimetres
 SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])

@@ -3,9 +3,6 @@
 import base64
 import json
 import re
-import shutil
-import subprocess
-from importlib import util
 from pathlib import Path
 
 import cv2
@@ -19,14 +16,8 @@ from stages.export.orbits import find_orbit
 from stages.export.page import build_page, rasterizer_constants
 from stages.export.splats import coefficients, pack, texels, used_degree, visible
 from stages.splatting.rendering import render
-
-_spec = util.spec_from_file_location("export_scene", Path(__file__).with_name("export_scene.py"))
-assert _spec and _spec.loader
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+from tests.browser import browse, console, needs_chromium
+from tests.stages import export_scene as scene
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -42,30 +33,6 @@ def page(degree: int = 1, photos: bool = True, gaussians: Gaussians | None = Non
         gaussians, cameras, find_orbit(cameras, [3.0] * 3), pictures if photos else {},
         rasterizer_constants(gaussians, cameras),
     )  # fmt: skip
-
-
-def browse(file: Path, address: str, size: tuple[int, int], *extra: str) -> tuple[str, str]:
-    """Open a page from disk in headless Chromium; returns what it printed, and its log."""
-    assert CHROMIUM
-    profile = file.parent / f"profile{len(list(file.parent.iterdir()))}"
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-        "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        "--hide-scrollbars", f"--window-size={size[0]},{size[1]}", "--virtual-time-budget=3000",
-        f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *extra,
-        f"file://{file}{address}",
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    return done.stdout, done.stderr
-
-
-def console(log: str) -> list[str]:
-    """Console messages of the page, without the graphics driver's remarks on speed."""
-    return [
-        line for line in log.splitlines()
-        if "CONSOLE" in line and "GL Driver Message" not in line
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -130,7 +97,9 @@ def test_a_browser_draws_what_our_rasterizer_draws(tmp_path: Path, lit: bool) ->
     file.write_text(page(gaussians=gaussians))
     shot = tmp_path / "shot.png"
     camera = scene.ball_cameras()[2].resized(640, 480)  # Chromium has no smaller windows than 500
-    _, log = browse(file, "#view=3&bare&still", (640, 480), f"--screenshot={shot}")
+    _, log = browse(
+        file, tmp_path, (640, 480), f"--screenshot={shot}", address="#view=3&bare&still"
+    )
     assert console(log) == []
     picture = cv2.imread(str(shot))[..., ::-1]
     expected = to_uint8(render(gaussians, camera).image)
@@ -214,7 +183,7 @@ def test_the_page_can_be_steered(tmp_path: Path) -> None:
     call = f"{numbers}, {camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}, 96, 72"
     file = tmp_path / "probe.html"
     file.write_text(page().replace("</body>", PROBE.replace("CAMERA", call)))
-    dom, log = browse(file, "", (480, 360), "--dump-dom", "--virtual-time-budget=20000")
+    dom, log = browse(file, tmp_path, (480, 360), "--dump-dom", "--virtual-time-budget=20000")
     assert console(log) == []
     result = json.loads(re.search(r"<pre id=\"result\">(.*?)</pre>", dom, re.S)[1])
     assert result["errors"] == ""
@@ -238,6 +207,6 @@ def test_without_webgl_the_page_says_so(tmp_path: Path) -> None:
     file = tmp_path / "viewer.html"
     blind = page(photos=False).replace('getContext("webgl2"', 'getContext("nothing"')
     file.write_text(blind)
-    dom, _ = browse(file, "", (480, 360), "--dump-dom")
+    dom, _ = browse(file, tmp_path, (480, 360), "--dump-dom")
     assert 'data-state="failed"' in dom
     assert "offers no WebGL2" in dom

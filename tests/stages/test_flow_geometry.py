@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import util
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
 from stages.flow.geometry import extend, occluded, pixel_grid, predicted_flow, splat_depth
-
-_spec = util.spec_from_file_location("flow_scene", Path(__file__).with_name("flow_scene.py"))
-assert _spec and _spec.loader
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import flow_scene as scene
 
 
 def shifted(camera: Camera, x: float) -> Camera:

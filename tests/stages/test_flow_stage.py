@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import util
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,7 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext, get_stage
 from stages.flow.geometry import occluded, predicted_flow
 from stages.flow.stage import FlowConfig, FlowStage
-
-_spec = util.spec_from_file_location("flow_scene", Path(__file__).with_name("flow_scene.py"))
-assert _spec and _spec.loader
-scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(scene)
+from tests.stages import flow_scene as scene
 
 Shot = tuple[Camera, View, np.ndarray]
 

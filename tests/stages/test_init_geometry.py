@@ -1,8 +1,6 @@
 """Two-view geometry, the pair graph, focal length and mapping, on points projected exactly."""
 
 from dataclasses import replace
-from importlib import util
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,14 +22,7 @@ from stages.init.mapping import Solution, map_views
 from stages.init.options import ClassicalOptions
 from stages.init.placement import Placement
 from stages.init.solver import Solver, known_focal, unknown_focal
-
-_spec = util.spec_from_file_location("init_scene", Path(__file__).with_name("init_scene.py"))
-assert _spec is not None
-assert _spec.loader is not None
-_scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(_scene)
-FOCAL, HEIGHT, WIDTH = _scene.FOCAL, _scene.HEIGHT, _scene.WIDTH
-make_scene, orbit, worst_rotation = _scene.make_scene, _scene.orbit, _scene.worst_rotation
+from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, orbit, worst_rotation
 
 
 def edge(rotation, inliers=200, coherence=0.95):

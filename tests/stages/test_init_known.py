@@ -223,6 +223,38 @@ def test_photographs_without_camera_are_named(tmp_path):
     assert sorted(found) == ["001", "002"]
 
 
+def test_the_names_that_fit_most_photographs_count():
+    """Every fifth image of a film, whose names are those of other views."""
+    pose = np.eye(4)
+    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
+    image = np.zeros((3, 4, 3), np.float32)
+    views = [View(f"{k:03d}", image, source_name=f"{5 * k:03d}.png") for k in range(12)]
+    by_source = [KnownCamera(f"images/{5 * k:03d}.jpg", lens, pose) for k in range(12)]
+    by_view = [KnownCamera(f"{k:03d}.png", lens, pose) for k in range(12)]
+    found = matching_cameras(by_source, views)
+    assert {name: known.name for name, known in found.items()} == {
+        f"{k:03d}": f"images/{5 * k:03d}.jpg" for k in range(12)
+    }
+    found = matching_cameras(by_view, views)
+    assert {name: known.name for name, known in found.items()} == {
+        f"{k:03d}": f"{k:03d}.png" for k in range(12)
+    }
+    both = matching_cameras(by_view[:3], [views[0], views[1], views[2]])
+    assert {name: known.name for name, known in both.items()} == {
+        name: f"{name}.png" for name in ("000", "001", "002")
+    }
+    two_ways = [
+        View("001", image, source_name="000.png"),
+        View("000", image, source_name="001.png"),
+    ]
+    found = matching_cameras(by_view, two_ways)
+    assert {name: known.name for name, known in found.items()} == {
+        "001": "000.png", "000": "001.png"
+    }, "of equally many, the names of the files count"  # fmt: skip
+    with pytest.raises(RequestError, match="2 cameras fit one photograph"):
+        matching_cameras([*by_view, KnownCamera("b/000.jpg", lens, pose)], views)
+
+
 def test_tracks_are_triangulated_and_wrong_matches_dropped():
     rng = np.random.default_rng(1)
     cameras = [Camera(str(k), 400, 400, 500, 500, 200, 200, look_at(15 * k)) for k in range(3)]

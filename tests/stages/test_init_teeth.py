@@ -170,7 +170,7 @@ def test_settings_reach_the_fit_in_working_pixels():
     assert teeth.surface_options(DentalConfig(gum_height=2)).gum_height == 2
 
 
-def unmatchable(count=3, teeth_like=False):
+def unmatchable(count=3):
     """Photographs that share nothing."""
     images = []
     for seed in range(count):

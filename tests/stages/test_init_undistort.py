@@ -1,8 +1,6 @@
 """Radial distortion: pixels both ways, images, and its estimate in bundle adjustment."""
 
 from dataclasses import replace
-from importlib import util
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -13,14 +11,7 @@ from stages.init.options import ClassicalOptions, RefinementOptions
 from stages.init.refine import refine_solution, robust_cost
 from stages.init.solver import Solver, unknown_focal
 from stages.init.undistort import distort_pixels, undistort_image, undistort_pixels
-
-_spec = util.spec_from_file_location("init_scene", Path(__file__).with_name("init_scene.py"))
-assert _spec is not None
-assert _spec.loader is not None
-_scene = util.module_from_spec(_spec)
-_spec.loader.exec_module(_scene)
-FOCAL, HEIGHT, WIDTH = _scene.FOCAL, _scene.HEIGHT, _scene.WIDTH
-make_scene, worst_rotation = _scene.make_scene, _scene.worst_rotation
+from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, worst_rotation
 
 SIZE = (WIDTH, HEIGHT)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from importlib import util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +24,8 @@ from stages.init.pointmap.predict import (
     source_files,
 )
 from stages.init.pointmap.quick_start import quick_start
+from tests.stages import pointmap_models as stand_in
 
-_spec = util.spec_from_file_location(
-    "pointmap_models", Path(__file__).with_name("pointmap_models.py")
-)
-assert _spec is not None and _spec.loader is not None
-stand_in = util.module_from_spec(_spec)
-import sys  # noqa: E402
-
-sys.modules["pointmap_models"] = stand_in
-_spec.loader.exec_module(stand_in)
 ANGLES = (-20.0, -4.0, 12.0)
 
 

@@ -81,11 +81,9 @@ class DenseView:
             depth nor fill is.
         filled: [H, W] float32: `depth` completed smoothly, backdrop pushed back; 0 outside the
             mask and where the completion would hide what another view sees.
-        agreeing: [H, W] int32 number of other views that agree with `depth`.
     """
 
     depth: Array
     confidence: Array
     normal: Array
     filled: Array
-    agreeing: npt.NDArray[np.int32]

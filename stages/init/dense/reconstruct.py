@@ -99,9 +99,8 @@ def complete_depths(
     available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
     numba.set_num_threads(max(1, min(threads, available)))
     try:
-        agreeing = [np.zeros(depth.shape, np.int32) for depth in depths]
         grays = [to_gray(image) for image in images]
-        return _finish(depths, confidences, agreeing, grays, valid, cameras, options)
+        return _finish(depths, confidences, grays, valid, cameras, options)
     finally:
         numba.set_num_threads(before)
 
@@ -142,7 +141,7 @@ def _dense_depths(
             depths, scores, agreeing, angles, shiny, strict=True
         )
     ]
-    return _finish(depths, confidences, agreeing, grays, valid, cameras, options)
+    return _finish(depths, confidences, grays, valid, cameras, options)
 
 
 def _sweep_view(
@@ -301,7 +300,6 @@ def confidence_of(
 def _finish(
     depths: list[Array],
     confidences: list[Array],
-    agreeing: list[npt.NDArray[np.int32]],
     grays: list[Array],
     valid: list[Mask],
     cameras: list[Camera],
@@ -322,7 +320,7 @@ def _finish(
         merged = np.where(known, depth, filled)
         weight = np.where(known, np.float32(1), np.float32(0.01))
         normal = normals_from_depth(merged, weight, cameras[index])
-        result.append(DenseView(depth, confidence, normal, filled, agreeing[index]))
+        result.append(DenseView(depth, confidence, normal, filled))
     return result
 
 

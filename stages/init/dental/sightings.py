@@ -51,7 +51,6 @@ class SeenRow:
         zeniths, tips: [n, 2]; nan where not to be relied on.
         papillae_left, papillae_right, embrasures_left, embrasures_right: [n, 2]; nan where none.
         doubtful: [n] bool.
-        ends: [n] bool, where the row is cut off.
     """
 
     jaw: Jaw
@@ -65,7 +64,6 @@ class SeenRow:
     embrasures_left: Array
     embrasures_right: Array
     doubtful: npt.NDArray[np.bool_]
-    ends: npt.NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.widths)
@@ -122,7 +120,6 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                 embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
                 embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
                 doubtful=doubtful,
-                ends=ends,
             )
         )
     return rows[0], rows[1]

@@ -94,7 +94,6 @@ class TeethMask:
 
     Attributes:
         mask: [H, W] bool.
-        range: greenness from, to.
         centre: median greenness of enamel.
         gum_gap: median greenness of enamel less that of the gum beside it.
         gum_contact: share of the outline that borders on gum.
@@ -103,7 +102,6 @@ class TeethMask:
     """
 
     mask: Bool
-    range: tuple[float, float]
     centre: float
     gum_gap: float
     gum_contact: float
@@ -294,7 +292,7 @@ def mask_of_range(
         max(0.0, contact - 2 * greener) * min(central / 0.25, 1.0) * wide * max(0.0, 1 - 2 * border)
     )
     return TeethMask(
-        kept, span, float(np.median(channels.greenness[kept])), gap, contact, fragments, score
+        kept, float(np.median(channels.greenness[kept])), gap, contact, fragments, score
     )
 
 

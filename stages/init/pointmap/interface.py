@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -92,23 +90,3 @@ class ModelCard:
     weights_gb: float
     gb_per_image: float
     pixels: int
-
-
-class PairModel(Protocol):
-    """A model that looks at two images at a time."""
-
-    card: ClassVar[ModelCard]
-
-    def predict_pair(self, first: PreparedView, second: PreparedView) -> PairPrediction:
-        """Pointmaps of both images in the frame of the first."""
-        ...
-
-
-class MultiViewModel(Protocol):
-    """A model that looks at all images together."""
-
-    card: ClassVar[ModelCard]
-
-    def predict_views(self, views: Sequence[PreparedView]) -> list[ViewPrediction]:
-        """Points of all images in one world, in the order of the views."""
-        ...
