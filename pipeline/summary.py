@@ -49,7 +49,7 @@ def print_summary(summary: RunSummary) -> None:
             console.print(warning, markup=False)
         pictures = stage.folder / "pictures" if stage.folder else None
         if pictures and pictures.is_dir():
-            console.print(f"Pictures to check ({stage.name}): {pictures}/", soft_wrap=True)
+            console.print(f"Pictures ({stage.name}): {pictures}/", soft_wrap=True)
     if text := headline(summary):
         console.print(f"\n{text}")
     if summary.results:

@@ -62,8 +62,8 @@ ROWS = tuple(dict.fromkeys([*VIEWS, *PHOTOS, *ABLATIONS]))
 
 DATA = {
     "views": "195 clinical videos",
-    "photos": "950 clinical cases of three photographs, on an RTX 4090",
-    "ablations": "195 clinical videos at 6 views, on an RTX 4090",
+    "photos": "950 clinical cases of three photographs",
+    "ablations": "195 clinical videos",
 }
 
 

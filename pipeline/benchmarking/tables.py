@@ -60,8 +60,9 @@ def paper_note(suite: Suite) -> str:
     sources = dict.fromkeys(DATA[table.form] for table in suite.tables)
     return (
         f"Ours are measured on {scenes}; the paper's figures beside them come from "
-        f"{' and '.join(sources)}, which are not public. The data differ, so that only the order "
-        "and the distances of methods can be compared with the paper's, not the figures themselves."
+        f"{' and '.join(sources)}, which are not public, and an RTX 4090. The data differ, so "
+        "that only the order and the distances of methods can be compared with the paper's, not "
+        "the figures themselves."
     )
 
 

@@ -55,9 +55,10 @@ def write_benchmark_report(results: Results, out: Path) -> Path:
             rows.append(found)
     cells = results["cells"]
     done = sum(record["status"] == "done" for record in cells)
+    scenes = len({record["scene"] for record in cells})
     cards = [
         {"value": f"{done} of {len(cells)}", "label": "cells done", "poor": done < len(cells)},
-        {"value": str(len({r["scene"] for r in cells})), "label": "scenes", "poor": False},
+        {"value": str(scenes), "label": "scenes" if scenes != 1 else "scene", "poor": False},
         {"value": str(len(titles)), "label": "methods", "poor": False},
         {"value": f"{sum(r.get('seconds', 0) for r in cells) / 60:,.0f} min",
          "label": "computing time of all cells, shared stages counted in each", "poor": False},

@@ -134,10 +134,13 @@ class FitConfig(StageConfig):
     position_lr_final: float = number(1.6e-6, "learning rate of positions at the end", gt=0)
     feature_lr: Auto | float = number(
         AUTO,
-        "learning rate of the constant colour (3DGS: 0.0025; auto: 2 or 6 times that)",
+        "learning rate of the constant colour (3DGS: 0.0025; auto: twice that; 6 times from 6 "
+        "views and on a held surface)",
     )
     feature_rest_lr: Auto | float = number(
-        AUTO, "learning rate of the other harmonics (3DGS: 0.000125)"
+        AUTO,
+        "learning rate of the other harmonics (3DGS: 0.000125; auto: a twentieth of feature_lr; "
+        "0.002 on a held surface)",
     )
     opacity_lr: float = number(0.05, "learning rate of opacities", ge=0)
     scaling_lr: Auto | float = number(AUTO, "learning rate of log scales (3DGS: 0.005)")
