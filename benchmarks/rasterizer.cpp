@@ -12,7 +12,8 @@
 
 namespace {
 
-constexpr int TILE = 16, SCREEN = 12, SLOT = 16;
+constexpr int TILE = 32, BLOCK = 4, SIDE = TILE / BLOCK, BLOCKS = SIDE * SIDE;
+constexpr int SCREEN = 16, SLOT = 16;
 constexpr float ALPHA_MAX = 0.99f, TRANSMITTANCE_MIN = 1e-4f, SAFETY = 0.01f;
 constexpr float HALF_LOG2E = 0.5f * 1.4426950408889634f;
 constexpr int NEVER = 2147483647;
@@ -35,30 +36,63 @@ inline V exp2_negative(V x) {
 }
 
 struct Ellipse {
-  float mx, my, a, b, c, e, peak, slope, a2, e2;
+  float mx, my, a, b, e, peak, slope, a2, e2;
 
   Ellipse(const float* q, int x0, int y0)
-      : mx(q[0] - x0 - 0.5f), my(q[1] - y0 - 0.5f), a(q[2]), b(q[3]), c(q[4]), e(q[9]),
-        peak(q[10]), slope(q[11]), a2(q[2] * HALF_LOG2E), e2(q[9] * HALF_LOG2E) {}
+      : mx(q[0] - x0 - 0.5f), my(q[1] - y0 - 0.5f), a(q[2]), b(q[3]), e(q[9]), peak(q[10]),
+        slope(q[11]), a2(q[2] * HALF_LOG2E), e2(q[9] * HALF_LOG2E) {}
 
-  V exponent(V lane, float dy, V& t) const {
-    t = _mm512_sub_ps(lane, set(mx - slope * dy));
-    return _mm512_fnmadd_ps(_mm512_mul_ps(set(a2), t), t, set(peak - e2 * dy * dy));
+  V exponent(V dy, V t) const {
+    const V power = _mm512_fnmadd_ps(_mm512_mul_ps(set(e2), dy), dy, set(peak));
+    return _mm512_fnmadd_ps(_mm512_mul_ps(set(a2), t), t, power);
   }
 
-  void rows(float reach, int columns, int rows, int& first, int& after) const {
-    const float shift = slope * reach, left = -mx, right = columns - 1 - mx;
-    const float at_top = std::min(std::max(-shift, left), right);
-    const float at_bottom = std::min(std::max(shift, left), right);
-    const float level = c * e * reach * reach, curve = a * e, inverse = 1 / c;
-    const float top = (std::sqrt(level - curve * at_top * at_top) - b * at_top) * inverse;
-    const float bottom = (-std::sqrt(level - curve * at_bottom * at_bottom) - b * at_bottom) * inverse;
-    const float lowest = std::max(std::ceil(my + bottom - SAFETY), 0.f);
-    const float highest = std::min(std::floor(my + top + SAFETY), float(rows - 1));
-    first = after = 0;
-    if (highest >= lowest) { first = int(lowest); after = int(highest) + 1; }
+  // The blocks of a tile that it touches: lanes 0-7 the right end of each row of blocks, 8-15 the
+  // left end.
+  uint64_t blocks(const float* q) const {
+    const float height = q[7];
+    const V band = _mm512_setr_ps(0, 4, 8, 12, 16, 20, 24, 28, 0, 4, 8, 12, 16, 20, 24, 28);
+    const V sign = _mm512_setr_ps(1, 1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1, -1, -1, -1);
+    const V offset = _mm512_mask_blend_ps(0xff00, set(1.f), set(SIDE + 1 - 1.f / BLOCK));
+    const V top = _mm512_sub_ps(band, set(my)), bottom = _mm512_add_ps(top, set(BLOCK - 1));
+    const __mmask16 touched = _mm512_cmp_ps_mask(top, set(height + SAFETY), _CMP_LE_OQ) &
+                              _mm512_cmp_ps_mask(bottom, set(-height - SAFETY), _CMP_GE_OQ);
+    const V y = _mm512_min_ps(_mm512_max_ps(_mm512_mul_ps(sign, set(q[12])), top), bottom);
+    const V extent = _mm512_sqrt_ps(_mm512_max_ps(
+        _mm512_mul_ps(_mm512_fnmadd_ps(y, y, set(height * height)), set(e * q[13])), set(0)));
+    V reach = _mm512_mul_ps(_mm512_fnmadd_ps(set(slope), y, set(mx)), sign);
+    reach = _mm512_add_ps(_mm512_add_ps(reach, extent), set(SAFETY));
+    reach = _mm512_fmadd_ps(reach, set(1.f / BLOCK), offset);
+    reach = _mm512_min_ps(_mm512_max_ps(reach, set(0)), set(SIDE));
+    const __m512i counts = _mm512_maskz_cvttps_epi32(touched, reach);
+    const __m256i ends = _mm512_castsi512_si256(counts);
+    const __m256i starts = _mm512_extracti64x4_epi64(counts, 1);
+    const __m256i below = _mm256_sub_epi32(_mm256_sllv_epi32(_mm256_set1_epi32(1), ends),
+                                           _mm256_set1_epi32(1));
+    const __m256i chosen = _mm256_andnot_si256(_mm256_srlv_epi32(_mm256_set1_epi32(255), starts), below);
+    return uint64_t(_mm_cvtsi128_si64(_mm256_cvtepi32_epi8(chosen)));
   }
 };
+
+// A tile of a plane as vectors, and back; the image is cut off at its right and lower edge.
+template <class T>
+void read_tile(const T* plane, int x0, int y0, int width, int height, T outside, T (*tile)[16]) {
+  for (int block = 0; block < BLOCKS; block++)
+    for (int lane = 0; lane < 16; lane++) {
+      const int x = x0 + block % SIDE * BLOCK + lane % BLOCK;
+      const int y = y0 + block / SIDE * BLOCK + lane / BLOCK;
+      tile[block][lane] = x < width && y < height ? plane[size_t(y) * width + x] : outside;
+    }
+}
+
+template <class T>
+void write_tile(const T (*tile)[16], int x0, int y0, int width, int height, T* plane) {
+  for (int y = y0; y < std::min(height, y0 + TILE); y++)
+    for (int x = x0; x < std::min(width, x0 + TILE); x++) {
+      const int block = (y - y0) / BLOCK * SIDE + (x - x0) / BLOCK;
+      plane[size_t(y) * width + x] = tile[block][(y - y0) % BLOCK * BLOCK + (x - x0) % BLOCK];
+    }
+}
 
 // The sums of 16 vectors in the 16 lanes of one.
 inline V sums(V (&rows)[16]) {
@@ -75,7 +109,8 @@ inline V sums(V (&rows)[16]) {
   return rows[0];
 }
 
-const __m512i COUNT = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+const V COLUMN = _mm512_setr_ps(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+const V ROW = _mm512_setr_ps(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
 
 }  // namespace
 
@@ -85,46 +120,40 @@ void set_threads(int threads) { omp_set_num_threads(threads); }
 
 void composite_forward(int tiles_x, int tiles_y, int width, int height, const int* offsets,
                        const int* members, const float* screen, const float* features,
-                       float alpha_cut, float* image, float* transmittance, int* stop, int* end,
-                       int* spans) {
-#pragma omp parallel for schedule(dynamic, 4)
+                       float alpha_cut, float* image, float* transmittance, int* stop,
+                       uint64_t* blocks) {
+#pragma omp parallel for schedule(dynamic, 1)
   for (int tile = 0; tile < tiles_x * tiles_y; tile++) {
     const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
-    const int rows = std::min(TILE, height - y0), columns = std::min(TILE, width - x0);
-    alignas(64) float state[4][TILE][TILE], final_left[TILE][TILE];
-    alignas(64) int until[TILE][TILE];
+    alignas(64) float state[4][BLOCKS][16], final_left[BLOCKS][16];
+    alignas(64) int until[BLOCKS][16];
     std::memset(state, 0, sizeof state);
-    std::memset(final_left, 0, sizeof final_left);
-    for (int r = 0; r < TILE; r++)
-      for (int x = 0; x < TILE; x++) {
-        const bool inside = r < rows && x < columns;
-        until[r][x] = inside ? NEVER : -1;
-        state[0][r][x] = inside;
+    uint64_t open = 0;
+    for (int block = 0; block < BLOCKS; block++)
+      for (int lane = 0; lane < 16; lane++) {
+        const bool inside = x0 + block % SIDE * BLOCK + lane % BLOCK < width &&
+                            y0 + block / SIDE * BLOCK + lane / BLOCK < height;
+        until[block][lane] = inside ? NEVER : -1;
+        state[0][block][lane] = inside;
+        final_left[block][lane] = 1;
+        open |= uint64_t(inside) << block;
       }
-    bool open[TILE];
-    const V lane = _mm512_cvtepi32_ps(COUNT);
-    const int first_pair = offsets[tile], last = offsets[tile + 1];
-    int k = first_pair;
-    for (; k < last; k++) {
-      if ((k - first_pair) % 16 == 0) {
-        bool some = false;
-        for (int r = 0; r < TILE; r++) {
-          open[r] = _mm512_reduce_max_epi32(_mm512_load_si512(until[r])) == NEVER;
-          some |= open[r];
-        }
-        if (!some) break;
-      }
+    const int last = offsets[tile + 1];
+    int k = offsets[tile];
+    for (; k < last && open; k++) {
       const float* q = screen + size_t(SCREEN) * members[k];
       const float* colour = features + size_t(3) * members[k];
       const Ellipse g(q, x0, y0);
-      int first, after;
-      g.rows(q[7], columns, rows, first, after);
-      spans[k] = first + 256 * after;
+      uint64_t todo = open & g.blocks(q);
+      blocks[k] = todo;
       const V red = set(colour[0]), green = set(colour[1]), blue = set(colour[2]);
-      for (int r = first; r < after; r++) {
-        if (!open[r]) continue;
-        V t;
-        V alpha = exp2_negative(g.exponent(lane, r - g.my, t));
+      const V from_x = _mm512_sub_ps(COLUMN, set(g.mx)), from_y = _mm512_sub_ps(ROW, set(g.my));
+      for (; todo; todo &= todo - 1) {
+        const int r = __builtin_ctzll(todo);
+        const V dx = _mm512_add_ps(from_x, set(r % SIDE * BLOCK));
+        const V dy = _mm512_add_ps(from_y, set(r / SIDE * BLOCK));
+        const V t = _mm512_fmadd_ps(set(g.slope), dy, dx);
+        V alpha = exp2_negative(g.exponent(dy, t));
         alpha = _mm512_min_ps(alpha, set(ALPHA_MAX));
         alpha = _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(alpha, set(alpha_cut), _CMP_GE_OQ), alpha);
         const V before = _mm512_load_ps(state[0][r]);
@@ -137,6 +166,8 @@ void composite_forward(int tiles_x, int tiles_y, int width, int height, const in
           _mm512_mask_store_ps(final_left[r], finished, before);
           w = _mm512_mask_mov_ps(w, finished, _mm512_setzero_ps());
           left = _mm512_mask_mov_ps(left, finished, _mm512_setzero_ps());
+          if (_mm512_reduce_max_epi32(_mm512_load_si512(until[r])) != NEVER)
+            open &= ~(uint64_t(1) << r);
         }
         _mm512_store_ps(state[0][r], left);
         _mm512_store_ps(state[1][r], _mm512_fmadd_ps(w, red, _mm512_load_ps(state[1][r])));
@@ -144,56 +175,50 @@ void composite_forward(int tiles_x, int tiles_y, int width, int height, const in
         _mm512_store_ps(state[3][r], _mm512_fmadd_ps(w, blue, _mm512_load_ps(state[3][r])));
       }
     }
-    end[tile] = k;
+    for (; k < last; k++) blocks[k] = 0;
+    for (int block = 0; block < BLOCKS; block++)
+      for (int lane = 0; lane < 16; lane++)
+        if (until[block][lane] != NEVER) state[0][block][lane] = final_left[block][lane];
     const size_t plane = size_t(width) * height;
-    for (int r = 0; r < rows; r++)
-      for (int x = 0; x < columns; x++) {
-        const size_t pixel = size_t(y0 + r) * width + x0 + x;
-        for (int j = 0; j < 3; j++) image[j * plane + pixel] = state[1 + j][r][x];
-        transmittance[pixel] = until[r][x] == NEVER ? state[0][r][x] : final_left[r][x];
-        stop[pixel] = until[r][x];
-      }
+    write_tile(state[0], x0, y0, width, height, transmittance);
+    write_tile(until, x0, y0, width, height, stop);
+    for (int j = 0; j < 3; j++) write_tile(state[1 + j], x0, y0, width, height, image + j * plane);
   }
 }
 
 void composite_backward(int tiles_x, int tiles_y, int width, int height, const int* offsets,
                         const int* members, const float* screen, const float* features,
-                        float alpha_cut, const float* transmittance, const int* stop,
-                        const int* end, const int* spans, const float* d_image,
+                        float alpha_cut, const int* slots, const float* transmittance,
+                        const int* stop, const uint64_t* blocks, const float* d_image,
                         const float* d_transmittance, float* slot_sums) {
-#pragma omp parallel for schedule(dynamic, 4)
+#pragma omp parallel for schedule(dynamic, 1)
   for (int tile = 0; tile < tiles_x * tiles_y; tile++) {
     const int x0 = tile % tiles_x * TILE, y0 = tile / tiles_x * TILE;
-    const int rows = std::min(TILE, height - y0), columns = std::min(TILE, width - x0);
-    alignas(64) float state[5][TILE][TILE];
-    alignas(64) int until[TILE][TILE];
-    std::memset(state, 0, sizeof state);
-    std::memset(until, -1, sizeof until);
+    alignas(64) float state[5][BLOCKS][16];
+    alignas(64) int until[BLOCKS][16];
     const size_t plane = size_t(width) * height;
-    for (int r = 0; r < rows; r++)
-      for (int x = 0; x < columns; x++) {
-        const size_t pixel = size_t(y0 + r) * width + x0 + x;
-        until[r][x] = stop[pixel];
-        state[0][r][x] = transmittance[pixel];
-        state[1][r][x] = transmittance[pixel] * d_transmittance[pixel];
-        for (int j = 0; j < 3; j++) state[2 + j][r][x] = d_image[j * plane + pixel];
-      }
-    int row_until[TILE];
-    for (int r = 0; r < TILE; r++)
-      row_until[r] = _mm512_reduce_max_epi32(_mm512_load_si512(until[r]));
-    const V lane = _mm512_cvtepi32_ps(COUNT), zero = _mm512_setzero_ps(), one = set(1.f);
-    for (int k = end[tile] - 1; k >= offsets[tile]; k--) {
+    read_tile(stop, x0, y0, width, height, -1, until);
+    read_tile(transmittance, x0, y0, width, height, 0.f, state[0]);
+    read_tile(d_transmittance, x0, y0, width, height, 0.f, state[1]);
+    for (int j = 0; j < 3; j++)
+      read_tile(d_image + j * plane, x0, y0, width, height, 0.f, state[2 + j]);
+    for (int block = 0; block < BLOCKS; block++)
+      for (int lane = 0; lane < 16; lane++) state[1][block][lane] *= state[0][block][lane];
+    const V zero = _mm512_setzero_ps(), one = set(1.f);
+    for (int k = offsets[tile + 1] - 1; k >= offsets[tile]; k--) {
       const float* colour = features + size_t(3) * members[k];
       const Ellipse g(screen + size_t(SCREEN) * members[k], x0, y0);
       const V red = set(colour[0]), green = set(colour[1]), blue = set(colour[2]);
+      const V from_x = _mm512_sub_ps(COLUMN, set(g.mx)), from_y = _mm512_sub_ps(ROW, set(g.my));
       const __m512i here = _mm512_set1_epi32(k);
-      V s = zero, sy = zero, syy = zero, abs_x = zero, abs_y = zero;
-      V s_red = zero, s_green = zero, s_blue = zero;
-      for (int r = spans[k] % 256; r < spans[k] / 256; r++) {
-        if (row_until[r] <= k) continue;
-        const float dy = r - g.my;
-        V t;
-        const V raw = exp2_negative(g.exponent(lane, dy, t));
+      V s = zero, sx = zero, sy = zero, sxx = zero, sxy = zero, syy = zero;
+      V abs_x = zero, abs_y = zero, s_red = zero, s_green = zero, s_blue = zero;
+      for (uint64_t todo = blocks[k]; todo; todo &= todo - 1) {
+        const int r = __builtin_ctzll(todo);
+        const V dx = _mm512_add_ps(from_x, set(r % SIDE * BLOCK));
+        const V dy = _mm512_add_ps(from_y, set(r / SIDE * BLOCK));
+        const V t = _mm512_fmadd_ps(set(g.slope), dy, dx);
+        const V raw = exp2_negative(g.exponent(dy, t));
         const __mmask16 taken = _mm512_cmp_ps_mask(raw, set(alpha_cut), _CMP_GE_OQ) &
                                 _mm512_cmpgt_epi32_mask(_mm512_load_si512(until[r]), here);
         const V alpha = _mm512_maskz_min_ps(taken, raw, set(ALPHA_MAX));
@@ -209,24 +234,24 @@ void composite_backward(int tiles_x, int tiles_y, int width, int height, const i
         ds = _mm512_maskz_mul_ps(_mm512_cmp_ps_mask(raw, set(ALPHA_MAX), _CMP_LE_OQ), alpha, ds);
         _mm512_store_ps(state[1][r], _mm512_fmadd_ps(w, along, rest));
         _mm512_store_ps(state[0][r], before);
-        const V d = _mm512_mul_ps(ds, set(dy));
+        const V by_x = _mm512_mul_ps(ds, dx), by_y = _mm512_mul_ps(ds, dy);
         s = _mm512_add_ps(s, ds);
-        sy = _mm512_add_ps(sy, d);
-        syy = _mm512_fmadd_ps(d, set(dy), syy);
+        sx = _mm512_add_ps(sx, by_x);
+        sy = _mm512_add_ps(sy, by_y);
+        sxx = _mm512_fmadd_ps(by_x, dx, sxx);
+        sxy = _mm512_fmadd_ps(by_x, dy, sxy);
+        syy = _mm512_fmadd_ps(by_y, dy, syy);
         abs_x = _mm512_add_ps(abs_x, _mm512_abs_ps(_mm512_mul_ps(ds, t)));
-        const V slope_y = _mm512_fmadd_ps(t, set(g.b), set(g.e * dy));
+        const V slope_y = _mm512_fmadd_ps(t, set(g.b), _mm512_mul_ps(set(g.e), dy));
         abs_y = _mm512_add_ps(abs_y, _mm512_abs_ps(_mm512_mul_ps(ds, slope_y)));
         s_red = _mm512_fmadd_ps(w, d_red, s_red);
         s_green = _mm512_fmadd_ps(w, d_green, s_green);
         s_blue = _mm512_fmadd_ps(w, d_blue, s_blue);
       }
-      const V dx = _mm512_sub_ps(lane, set(g.mx)), sx = _mm512_mul_ps(s, dx);
-      V parts[16] = {s, sy, syy, sx, _mm512_mul_ps(sy, dx), _mm512_mul_ps(sx, dx), abs_x, abs_y,
+      V parts[16] = {s, sy, syy, sx, sxy, sxx, abs_x, abs_y,
                      s_red, s_green, s_blue, zero, zero, zero, zero, zero};
-      _mm512_storeu_ps(slot_sums + size_t(SLOT) * k, sums(parts));
+      _mm512_storeu_ps(slot_sums + size_t(SLOT) * slots[k], sums(parts));
     }
-    for (int k = end[tile]; k < offsets[tile + 1]; k++)
-      _mm512_storeu_ps(slot_sums + size_t(SLOT) * k, zero);
   }
 }
 }

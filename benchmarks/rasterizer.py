@@ -34,6 +34,7 @@ from stages.splatting import raster
 from stages.splatting.adam import Adam
 from stages.splatting.loss import ColourLoss
 from stages.splatting.rasterizer import ALPHA_CUT, Rendering, Viewpoint, rasterize, use_threads
+from stages.splatting.threads import workers
 
 WIDTH, HEIGHT, FOCAL = 512, 384, 600.0
 SOURCE = Path(__file__).with_suffix(".cpp")
@@ -145,43 +146,41 @@ def compare_one(peer: ctypes.CDLL, packed: np.ndarray, repetitions: int) -> list
     viewpoint = view()
     rendering = rasterize(packed, viewpoint, degree=1, near=0.1)
     f, screen = rendering._forward, rendering.screen
-    stride, cut = raster.tile_stride(f.tiles_x * f.tiles_y), np.float32(ALPHA_CUT)
+    threads, cut = workers(), np.float32(ALPHA_CUT)
     random = np.random.default_rng(2)
     d_image = random.normal(size=rendering.planes.shape).astype(np.float32)
-    d_left = random.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    d_left = random.normal(size=(1, HEIGHT, WIDTH)).astype(np.float32)
+    state = ("image", "transmittance", "stop", "blocks")
     everything = np.empty((0, 0), np.bool_)
 
     def outputs() -> dict[str, Any]:
-        arrays = (rendering.planes, rendering.transmittance, f.stop, f.end, f.spans)
-        names = ("image", "transmittance", "stop", "end", "spans")
-        made = {name: np.zeros_like(array) for name, array in zip(names, arrays, strict=True)}
+        arrays = (rendering.planes, rendering.transmittance[None], f.stop, f.blocks)
+        made = {name: np.zeros_like(array) for name, array in zip(state, arrays, strict=True)}
         return made | {"slots": raster.aligned_empty(len(f.members), SLOT_COLUMNS)}
 
     ours, theirs = outputs(), outputs()
     lists = (f.tiles_x, f.tiles_y, WIDTH, HEIGHT, *map(address, (f.offsets, f.members)))
     given = (*lists, address(screen), address(f.features), ctypes.c_float(cut))
-    forward_names = ("image", "transmittance", "stop", "end", "spans")
-    state = ("transmittance", "stop", "end", "spans")
 
     def forward() -> None:
         raster.composite_forward(
-            f.tiles_x, f.tiles_y, stride, f.offsets, f.members, screen, f.features, cut, everything,
-            *(ours[name] for name in forward_names),
+            threads, f.tiles_x, f.offsets, f.members, screen, f.features, cut, everything,
+            *(ours[name] for name in state),
         )  # fmt: skip
 
     def backward() -> None:
         raster.composite_backward(
-            f.tiles_x, f.tiles_y, stride, f.offsets, f.members, screen, f.features, cut,
-            *(ours[name] for name in state), d_image, d_left, ours["slots"],
+            threads, f.tiles_x, f.offsets, f.members, f.slots, screen, f.features, cut,
+            *(ours[name] for name in state[1:]), d_image, d_left, ours["slots"],
         )  # fmt: skip
 
     def peer_forward() -> None:
-        peer.composite_forward(*given, *(address(theirs[name]) for name in forward_names))
+        peer.composite_forward(*given, *(address(theirs[name]) for name in state))
 
     def peer_backward() -> None:
         peer.composite_backward(
-            *given, *(address(theirs[name]) for name in state), address(d_image), address(d_left),
-            address(theirs["slots"]),
+            *given, address(f.slots), *(address(theirs[name]) for name in state[1:]),
+            address(d_image), address(d_left), address(theirs["slots"]),
         )  # fmt: skip
 
     times = measure([forward, peer_forward, backward, peer_backward], repetitions)

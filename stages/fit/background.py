@@ -7,12 +7,46 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit, prange
 
 from stages.fit.settings import FitSettings
 from stages.fit.targets import Target
+from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _lay_over(  # type: ignore[no-untyped-def]
+    image: Floats, transmittance: Floats, colour: Floats, result: Floats
+):
+    channels, height, width = image.shape
+    for row in prange(channels * height):
+        channel, y = row // height, row % height
+        behind = colour[channel]
+        for x in range(width):
+            result[channel, y, x] = image[channel, y, x] + transmittance[y, x] * behind
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _pull_back(  # type: ignore[no-untyped-def]
+    d_image: Floats, transmittance: Floats, colour: Floats, d_transmittance: Floats, sums: Array
+):
+    """Gradients of `_lay_over`: of the transmittance (added to), of the colour in `sums` [H, 3]."""
+    height, width = transmittance.shape
+    for y in prange(height):
+        red, green, blue = 0.0, 0.0, 0.0
+        for x in range(width):
+            left = transmittance[y, x]
+            r, g, b = d_image[0, y, x], d_image[1, y, x], d_image[2, y, x]
+            red += r * left
+            green += g * left
+            blue += b * left
+            d_transmittance[y, x] += r * colour[0] + g * colour[1] + b * colour[2]
+        sums[y, 0] = red
+        sums[y, 1] = green
+        sums[y, 2] = blue
 
 
 class Background:
@@ -36,20 +70,36 @@ class Background:
         self.moments = np.zeros((2, 3))
         self.steps = 0
 
-    def colour(self) -> Floats:
-        """[3, 1, 1] float32, for planar images."""
-        return np.asarray(self.values[:, None, None], np.float32)
-
     def behind(self, image: Floats, transmittance: Floats) -> Floats:
         """[3, H, W] an image laid over the background through what it lets pass, [H, W]."""
-        return image + transmittance * self.colour() if self.values.any() else image
+        if not self.values.any():
+            return image
+        result = np.empty(image.shape, np.float32)
+        with KERNELS:
+            _lay_over(image, transmittance, self.values.astype(np.float32), result)
+        return result
 
-    def step(self, d_image: Floats, transmittance: Floats) -> None:
-        """Move the colour against the gradient [3, H, W] of the image laid over it."""
+    def step(
+        self, d_image: Floats, transmittance: Floats, d_transmittance: Floats | None = None
+    ) -> None:
+        """Move the colour against the gradient [3, H, W] of an image laid over it.
+
+        What that gradient says of the transmittance is added to `d_transmittance` [H, W].
+        """
+        if not (self.learned or self.values.any()):
+            return
+        sums = np.empty((len(transmittance), 3))
+        if d_transmittance is None:
+            d_transmittance = np.zeros_like(transmittance)
+        with KERNELS:
+            _pull_back(
+                d_image, transmittance, self.values.astype(np.float32), d_transmittance, sums
+            )
         if not self.learned:
             return
+        gradient = sums.sum(0)
         self.steps += 1
-        gradient = (d_image * transmittance).sum((1, 2), dtype=np.float64)
+        gradient = sums.sum(0)
         self.moments[0] = 0.9 * self.moments[0] + 0.1 * gradient
         self.moments[1] = 0.99 * self.moments[1] + 0.01 * gradient**2
         mean = self.moments[0] / (1 - 0.9**self.steps)

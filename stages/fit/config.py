@@ -41,7 +41,11 @@ class FitConfig(StageConfig):
         le=1,
     )
     fill_share: float = number(
-        0.03, "largest share of the Gaussians that starts from points filled in", ge=0, le=1
+        0.0,
+        "largest share of the Gaussians that starts from points filled in; 0: none, what was not "
+        "measured grows from what was",
+        ge=0,
+        le=1,
     )
     normal_neighbours: int = number(
         12, "average normals over so many points; 0: as they are", ge=0, le=200
@@ -78,7 +82,8 @@ class FitConfig(StageConfig):
     light: Literal["auto", "camera", "none"] = number(
         "auto",
         "a light beside the lens: albedo, normals, falloff and highlights in place of spherical "
-        "harmonics (auto: where a short trial predicts a held-out photograph better with it)",
+        "harmonics (auto: where a short trial predicts a held-out photograph better with it; on a "
+        "held surface where it explains how colours change between photographs)",
     )
     light_diffuse: float = number(
         0.9,
@@ -88,17 +93,23 @@ class FitConfig(StageConfig):
     )
     light_falloff: float = number(2.0, "exponent of the light's falloff, to start with", ge=0, le=4)
     light_widths: tuple[float, float] = number(
-        (100.0, 15.0), "exponents m of the narrow and broad highlight lobe, to start with"
+        (200.0, 25.0), "exponents m of the narrow and broad highlight lobe, to start with"
     )
-    light_strengths: tuple[float, float] = number(
-        (0.5, 0.04), "strengths of the two lobes in linear light, to start with"
+    light_strengths: Auto | tuple[float, float] = number(
+        AUTO,
+        "strengths of the two lobes in linear light, to start with (auto: 0.5 and 0.04; 0.15 and "
+        "0.04 on a held surface)",
     )
     light_gamma: float = number(2.2, "exponent of the photographs' encoding", ge=1, le=4)
     light_albedo_lr: Auto | float = number(AUTO, "learning rate of albedos")
     light_normal_lr: float = number(5e-3, "learning rate of the normals that are lit", ge=0)
     light_lr: float = number(1e-2, "learning rate of logit k and of the lobes' log widths", ge=0)
     light_falloff_lr: float = number(5e-3, "learning rate of the falloff's exponent", ge=0)
-    light_strength_lr: float = number(2e-2, "learning rate of the lobes' log strengths", ge=0)
+    light_strength_lr: Auto | float = number(
+        AUTO,
+        "learning rate of the lobes' log strengths (auto: 0.02; 0 on a held surface: views too far "
+        "apart to share a highlight bend normals until any strength fits)",
+    )
     light_lr_decay: float = number(
         0.1, "what the light's, albedos' and normals' rates have fallen to at the end", gt=0, le=1
     )
@@ -116,6 +127,13 @@ class FitConfig(StageConfig):
     light_margin: float = number(
         0.1, "dB by which the trial with a light has to be better on the held-out photograph", ge=0
     )
+    light_evidence: float = number(
+        0.7,
+        "on a held surface there is a light if its shading lowers the error of predicting the "
+        "photographs from one another to this share",
+        ge=0,
+        le=1,
+    )
     lambda_dssim: float = number(
         0.2, "weight of 1 - SSIM against L1 in the colour loss", ge=0, le=1
     )
@@ -129,9 +147,13 @@ class FitConfig(StageConfig):
     coarse_fraction: float = number(0.6, "share of the iterations at reduced size", ge=0, le=1)
     coarse_factor: int = number(2, "by which factor images are reduced then", ge=1, le=8)
     position_lr_init: float = number(
-        1.6e-4, "learning rate of positions at the start, relative to the scene's extent", gt=0
+        3.2e-4,
+        "learning rate of positions at the start, relative to the scene's extent (3DGS: 1.6e-4)",
+        gt=0,
     )
-    position_lr_final: float = number(1.6e-6, "learning rate of positions at the end", gt=0)
+    position_lr_final: float = number(
+        1.6e-5, "learning rate of positions at the end (3DGS: 1.6e-6)", gt=0
+    )
     feature_lr: Auto | float = number(
         AUTO,
         "learning rate of the constant colour (3DGS: 0.0025; auto: twice that; 6 times from 6 "
@@ -264,6 +286,7 @@ class FitConfig(StageConfig):
             "feature_rest_lr": 0, "light_albedo_lr": 0, "scaling_lr": 0, "rotation_lr": 0,
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
+            "light_strength_lr": 0,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0

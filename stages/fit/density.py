@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit, prange
+
+from stages.splatting.threads import KERNELS
 
 Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 #: a split Gaussian's halves are smaller by this factor (3DGS)
 SPLIT_SHRINK = 1.6
+#: Gaussians per chunk of a kernel
+CHUNK = 4096
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _accumulate(  # type: ignore[no-untyped-def]
+    centres: Floats, absolute: Floats, visible: Bools, half_width: np.float32,
+    half_height: np.float32, signed_sum: Floats, absolute_sum: Floats, seen: Floats,
+):  # fmt: skip
+    """Add the norms of gradients [N, 2] of the visible Gaussians, and count these."""
+    number = centres.shape[0]
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            if visible[i]:
+                x, y = centres[i, 0] * half_width, centres[i, 1] * half_height
+                signed_sum[i] += math.sqrt(x * x + y * y)
+                x, y = absolute[i, 0] * half_width, absolute[i, 1] * half_height
+                absolute_sum[i] += math.sqrt(x * x + y * y)
+                seen[i] += np.float32(1)
 
 
 @dataclass
@@ -35,10 +58,13 @@ class DensityStatistics:
         self, centres: Floats, absolute: Floats, visible: Bools, width: int, height: int
     ) -> None:
         """Add one view's gradients [N, 2], px^-1; they are kept per half image (NDC)."""
-        half = np.array([width / 2, height / 2], np.float32)
-        self.signed += np.where(visible, np.sqrt(((centres * half) ** 2).sum(1)), 0)
-        self.absolute += np.where(visible, np.sqrt(((absolute * half) ** 2).sum(1)), 0)
-        self.seen += visible
+        with KERNELS:
+            _accumulate(
+                np.ascontiguousarray(centres, np.float32),
+                np.ascontiguousarray(absolute, np.float32), np.ascontiguousarray(visible),
+                np.float32(width / 2), np.float32(height / 2), self.signed, self.absolute,
+                self.seen,
+            )  # fmt: skip
 
 
 def rotations(quats: Floats) -> Floats:

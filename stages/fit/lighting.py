@@ -10,20 +10,47 @@ import numpy as np
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import ReconstructionError
 from stages.fit.initial import facing, headlight_harmonics
+from stages.fit.light_evidence import prediction_errors
 from stages.fit.scene import Scene
 from stages.fit.settings import FitSettings
 from stages.fit.trainer import Trainer
 from stages.splatting.projection import HARMONICS
 
+#: points of less confidence are guesses, even where a held surface is made of them
+MEASURED = 1.5
+
 
 def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
+    """Whether a light beside the lens explains the photographs better than none.
+
+    Returns:
+        ``"camera"`` or ``"none"``, and the figures that say so.
+    """
+    return _by_shading(scene, settings) if settings.hold_surface else _by_trial(scene, settings)
+
+
+def _by_shading(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
+    """From shared surface: photographs this far apart can't predict one another as a whole."""
+    cloud = scene.cloud
+    errors = prediction_errors(
+        cloud.select(cloud.weight > MEASURED),
+        [view.image for view in scene.views], [view.valid() for view in scene.views],
+        scene.cameras, settings.light_gamma,
+    )  # fmt: skip
+    if errors is None:
+        return "none", {}
+    without, lit = errors
+    better = lit <= settings.light_evidence * without
+    figures = {"light_error_none": round(without, 4), "light_error_camera": round(lit, 4)}
+    return ("camera" if better else "none"), figures
+
+
+def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
     """Fit all photographs but one, with and without a light, and see which predicts that one.
 
     The one left out has a neighbour on either side: the model is to fill gaps, not to extrapolate.
     Small images, few Gaussians and few steps: how the light moves shows long before any detail.
-
-    Returns:
-        ``"camera"`` or ``"none"``, and the PSNR of either on the photograph that was left out.
+    The figures are the PSNR of either on the photograph that was left out.
     """
     held = middle_view(scene.cameras)
     rest = scene.without(held)

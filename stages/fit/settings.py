@@ -48,6 +48,7 @@ class FitSettings:
     light_trial_points: int
     light_trial_factor: int
     light_margin: float
+    light_evidence: float
     lambda_dssim: float
     lambda_flow: float
     lambda_depth: float
@@ -132,6 +133,8 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "feature_rest_lr": 2.5e-3 / 20 * rate,
         # in colour, not in harmonics: C0 times as much
         "light_albedo_lr": 7e-4 * rate,
+        "light_strengths": (0.5, 0.04),
+        "light_strength_lr": 2e-2,
         "scaling_lr": 5e-3 * rate,
         "rotation_lr": 1e-3 * rate,
         "densify": many,
@@ -149,6 +152,8 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
             "final_prune_masked": 0.0,
             "feature_lr": 1.5e-2,
             "feature_rest_lr": 2e-3,
+            "light_strengths": (0.15, 0.04),
+            "light_strength_lr": 0.0,
         }
     return chosen
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import isqrt
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from stages.fit.state import restore_state, save_state
 from stages.fit.surface import HeldSurface
 from stages.fit.targets import Target
 from stages.splatting.adam import Adam
+from stages.splatting.projection import HARMONICS
 from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint, rasterize
 
 Array = npt.NDArray[np.float64]
@@ -100,6 +102,7 @@ class Trainer:
         if held_surface is not None:
             content.update(held_surface.anchor.tobytes())
         self.fingerprint = content.hexdigest()
+        self._use_harmonics()
 
     def viewpoint(self, view: int, target: Target) -> Viewpoint:
         pose = np.ascontiguousarray(self.poses.poses[view], np.float32)
@@ -114,6 +117,15 @@ class Trainer:
         if every <= 0:
             return self.settings.sh_degree
         return min(self.settings.sh_degree, self.iteration // every)
+
+    def _use_harmonics(self) -> None:
+        """Keep what the degree needs by now: harmonics still to come are 0, and cost time."""
+        used = HARMONICS + 3 * (self.degree() + 1) ** 2
+        missing = used - self.packed.shape[1]
+        free = self.light is None and self.progressive is None
+        if missing and free and not self.packed[:, used:].any():
+            self.packed = np.pad(self.packed[:, :used], ((0, 0), (0, max(0, missing))))
+            self.adam.resize(used)
 
     def picture(self, pose: Array, target: Target) -> Floats:
         """[3, H, W] what a camera that is none of the fit's sees, without exposure."""
@@ -131,7 +143,8 @@ class Trainer:
         """The Gaussians from anywhere, colour only."""
         if self.light is not None:
             self.light.shade(self.packed, viewpoint)
-        degree = 0 if self.light is not None else self.settings.sh_degree
+        terms = (self.packed.shape[1] - HARMONICS) // 3
+        degree = 0 if self.light is not None else min(self.settings.sh_degree, isqrt(terms) - 1)
         return rasterize(self.packed, viewpoint, degree=degree, near=self.settings.near)
 
     def composited(self, view: int, rendering: Rendering) -> Floats:
@@ -151,6 +164,7 @@ class Trainer:
             self.queue = [int(v) for v in self.random.permutation(views)]
         view = self.queue.pop()
         self.iteration += 1
+        self._use_harmonics()
         factor = s.coarse_factor if self.iteration <= s.coarse_fraction * s.iterations else 1
         target = self.targets[view][factor]
         flow = target.flow if self._with_flow() else None
@@ -219,22 +233,19 @@ class Trainer:
         """Loss, PSNR, and the gradients of a rendered view."""
         s = self.settings
         image = self.composited(view, rendering)
-        # what the camera clips may be brighter: no error there, and no gradient
-        white = (target.colour.target >= s.saturation) & (image > target.colour.target)
-        colour = target.colour(np.where(white, target.colour.target, image), s.lambda_dssim)
+        colour = target.colour(image, s.lambda_dssim, s.saturation)
         loss, d_image = colour.loss, colour.gradient
-        d_image[white] = 0
-        d_planes = np.zeros_like(rendering.planes)
         d_transmittance = np.zeros_like(rendering.transmittance)
         if s.exposure:
             # the same number of steps for every view, to within one
             steps = 1 + (self.iteration - 1) // len(self.targets)
             unexposed = self.background.behind(rendering.planes[:3], rendering.transmittance)
             d_image = self.exposure.step(view, unexposed, d_image, s.exposure_lr, steps)
-        d_planes[:3] = d_image
-        if self.background.values.any():
-            d_transmittance += (d_image * self.background.colour()).sum(0)
-        self.background.step(d_image, rendering.transmittance)
+        self.background.step(d_image, rendering.transmittance, d_transmittance)
+        d_planes = d_image
+        if len(rendering.planes) > len(d_image):
+            d_planes = np.zeros_like(rendering.planes)
+            d_planes[:3] = d_image
         with_depth = self._with_depth(target)
         if with_depth:
             loss += 2 * s.lambda_depth * depth_loss(

@@ -63,3 +63,10 @@ class Adam:
         """Rows follow `source` [N']; where `fresh` [N'] they start from zero."""
         self.first = np.where(fresh[:, None], F(0), self.first[source])
         self.second = np.where(fresh[:, None], F(0), self.second[source])
+
+    def resize(self, columns: int) -> None:
+        """Drop the last columns, or add some; those start from zero."""
+        more = max(0, columns - self.first.shape[1])
+        self.first, self.second = (
+            np.pad(moment[:, :columns], ((0, 0), (0, more))) for moment in (self.first, self.second)
+        )

@@ -20,12 +20,12 @@ GRADIENTS = 8
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def gather(  # type: ignore[no-untyped-def]
-    first_slot: Ints, slots: Ints, slot_sums: Floats, screen: Floats, gradient: Floats
+    first_slot: Ints, slot_sums: Floats, screen: Floats, gradient: Floats
 ):
     """Add the slots of each Gaussian, in the order of its tiles, and make gradients of the sums.
 
     Args:
-        first_slot, slots: from `list_tiles` and `fill_tiles`.
+        first_slot: [N + 1], from where to where the slots of each Gaussian go.
         slot_sums: [M, 16 n] from `composite_backward`.
         gradient: [N, 8 + 3 + E] output: centre 2, conic a b c, opacity, sums of the absolute
             per-pixel gradients of the centre 2, features.
@@ -43,7 +43,7 @@ def gather(  # type: ignore[no-untyped-def]
             for j in range(room):
                 part = spread(F(0))
                 for q in range(first_slot[i], first_slot[i + 1]):
-                    part += load(slot_sums, slots[q] * room + j)
+                    part += load(slot_sums, q * room + j)
                 store(total, j, part)
             a, b, c = screen[i, 2], screen[i, 3], screen[i, 4]
             sy, sx = total[0, 1], total[0, 3]

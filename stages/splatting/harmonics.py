@@ -92,7 +92,7 @@ def features_forward(  # type: ignore[no-untyped-def]
         packed: [N, 11 + 3 K] scene.
         degree: of the harmonics, 0..3; K >= (degree + 1)^2. -1 for no colour.
         centre: [3] camera centre in the world.
-        screen: [N, 12] projected Gaussians.
+        screen: [N, 16] projected Gaussians.
         next_pose, next_intrinsics: [3, 4] and [4], the camera that flow leads to.
         with_depth, with_flow: 1 to add a depth feature, then two flow features (px).
         near: depth at which the next camera's division is held.

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
@@ -37,17 +38,19 @@ from stages.splatting.lane_types import (
     spread_value,
 )
 
+F = np.float32
+
 #: untyped: inside a kernel these functions have other arguments than here
 intrinsic: Any = _intrinsic
 
 
-def _address(context: Any, builder: Any, kind: Any, value: Any, index: Any, vector: Any) -> Any:
+def address_of(context: Any, builder: Any, kind: Any, value: Any, index: Any, vector: Any) -> Any:
     """Pointer to the vector that begins at item `index` of an array seen as one row."""
     array = context.make_array(kind)(context, builder, value)
     return builder.bitcast(builder.gep(array.data, [index]), vector.as_pointer())
 
 
-def _vector_of(kind: Any) -> tuple[Any, Any]:
+def vector_of(kind: Any) -> tuple[Any, Any]:
     if isinstance(kind, types.Array) and kind.layout == "C":
         if kind.dtype == types.float32:
             return lanes, FLOATS
@@ -59,11 +62,11 @@ def _vector_of(kind: Any) -> tuple[Any, Any]:
 @intrinsic
 def load_from(typing_context, array, index):  # type: ignore[no-untyped-def]
     """16 items of a contiguous array, seen as one row, from `index` on; no bounds check."""
-    kind, vector = _vector_of(array)
+    kind, vector = vector_of(array)
 
     def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         value, index = arguments
-        pointer = _address(context, builder, sig.args[0], value, index, vector)
+        pointer = address_of(context, builder, sig.args[0], value, index, vector)
         return builder.load(pointer, align=4)
 
     return kind(array, types.intp), generate
@@ -72,11 +75,11 @@ def load_from(typing_context, array, index):  # type: ignore[no-untyped-def]
 @intrinsic
 def store_from(typing_context, array, index, value):  # type: ignore[no-untyped-def]
     """Put a vector where `load_from` would read it."""
-    kind, vector = _vector_of(array)
+    kind, vector = vector_of(array)
 
     def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
         target, index, lanes_value = arguments
-        pointer = _address(context, builder, sig.args[0], target, index, vector)
+        pointer = address_of(context, builder, sig.args[0], target, index, vector)
         builder.store(lanes_value, pointer, align=4)
         return context.get_dummy_value()
 
@@ -219,6 +222,16 @@ def truncate(typing_context, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def minus(typing_context, value):  # type: ignore[no-untyped-def]
+    """-x of integers."""
+
+    def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        return builder.sub(ir.Constant(INTS, [0] * WIDTH), arguments[0])
+
+    return int_lanes(int_lanes), generate
+
+
+@intrinsic
 def to_float(typing_context, value):  # type: ignore[no-untyped-def]
     """int32 to float32."""
 
@@ -266,6 +279,19 @@ def largest(typing_context, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def root(typing_context, value):  # type: ignore[no-untyped-def]
+    """Square root."""
+
+    def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        kind = ir.FunctionType(FLOATS, [FLOATS])
+        name = f"llvm.sqrt.v{WIDTH}f32"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, arguments)
+
+    return lanes(lanes), generate
+
+
+@intrinsic
 def sums(typing_context, vectors):  # type: ignore[no-untyped-def]
     """The sums of 16 vectors in the 16 lanes of one, by a tree of shuffles: a fixed order."""
     if not isinstance(vectors, types.UniTuple) or vectors.count != WIDTH:
@@ -290,3 +316,42 @@ def sums(typing_context, vectors):  # type: ignore[no-untyped-def]
         return rows[0]
 
     return lanes(vectors), generate
+
+
+@njit(inline="always", error_model="numpy")
+def exponential(x):  # type: ignore[no-untyped-def]
+    """e^x, relative error below 5e-6 (5e-7 for |x| < 10), held between 1e-38 and 1e38.
+
+    What is not finite gives not a number.
+    """
+    zero_or_nan = x * F(0)
+    x = at_most(at_least(x * F(1.44269504), F(-126.0)), F(126.0))
+    # the nearest whole number: truncate rounds towards 0
+    whole = truncate(x + where(x > F(0), spread(F(0.5)), F(-0.5)))
+    part = (x - to_float(whole)) * F(0.693147181)
+    series = F(1 / 120) + part * (F(1 / 720) + part * F(1 / 5040))
+    series = F(0.5) + part * (F(1 / 6) + part * (F(1 / 24) + part * series))
+    return scale_by_power(F(1) + part * (F(1) + part * series), whole) + zero_or_nan
+
+
+@intrinsic
+def power_of(typing_context, value):  # type: ignore[no-untyped-def]
+    """The whole number n for which a positive value lies between 0.707 and 1.414 times 2^n."""
+
+    def generate(context, builder, sig, arguments):  # type: ignore[no-untyped-def]
+        bits = builder.bitcast(arguments[0], INTS)
+        from_root = builder.sub(bits, ir.Constant(INTS, [0x3F3504F3] * WIDTH))
+        return builder.ashr(from_root, ir.Constant(INTS, [23] * WIDTH))
+
+    return int_lanes(lanes), generate
+
+
+@njit(inline="always", error_model="numpy")
+def log2(x):  # type: ignore[no-untyped-def]
+    """Logarithm to base 2 of positive numbers, to float32's precision."""
+    power = power_of(x)
+    part = scale_by_power(x, minus(power))
+    ratio = (part - F(1)) / (part + F(1))
+    square = ratio * ratio
+    series = F(1 / 3) + square * (F(1 / 5) + square * (F(1 / 7) + square * F(1 / 9)))
+    return to_float(power) + F(2.88539008) * (ratio + ratio * square * series)

@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting.blocks import take_number
 from stages.splatting.lane_types import WIDTH as LANES
-from stages.splatting.lanes import load_from, store_from
-from stages.splatting.threads import KERNELS
+from stages.splatting.lanes import absolute, constant, load_from, spread, store_from, sums, where
+from stages.splatting.rows import load_part, store_part, windowed
+from stages.splatting.threads import KERNELS, workers
 
 Floats = npt.NDArray[np.float32]
 F = np.float32
@@ -26,148 +28,243 @@ WINDOW = (_window / _window.sum()).astype(np.float32)
 C1, C2 = F(0.01**2), F(0.03**2)
 #: rows of a strip: the unit of parallel work
 STRIP = 32
+#: columns of a strip: short pieces of rows come from memory half as fast
+COLUMNS = 512
+#: rows that a strip looks at, and columns, an odd number of vectors
+ROWS, PITCH = STRIP + 2 * HALF, COLUMNS + LANES
+#: numbers from one windowed map of a strip to the next
+MAP = ROWS * PITCH
+#: brighter than any target
+MOST = 1e30
 
 
 @njit(inline="always", error_model="numpy")
-def _blur(source, start, step, target, to, wide):  # type: ignore[no-untyped-def]
-    """Window over items `step` apart of `source`, from `start` on: `wide` results at `to`.
+def _weights():  # type: ignore[no-untyped-def]
+    return (
+        constant(WINDOW[0]), constant(WINDOW[1]), constant(WINDOW[2]), constant(WINDOW[3]),
+        constant(WINDOW[4]), constant(WINDOW[5]),
+    )  # fmt: skip
 
-    Sums stay in a register; the plain loop over an array stores and loads them at every tap.
+
+@njit(inline="always", error_model="numpy")
+def _down(across, at, weights):  # type: ignore[no-untyped-def]
+    """Window over the column of vectors that begins at `at`.
+
+    Written out: as a loop over the taps it takes twice as long.
     """
-    for x in range(0, wide, LANES):
-        total = load_from(source, start + x) * WINDOW[0]
-        for k in range(1, TAPS):
-            total += load_from(source, start + x + k * step) * WINDOW[k]
-        store_from(target, to + x, total)
+    w0, w1, w2, w3, w4, w5 = weights
+    near = load_from(across, at + 5 * PITCH) * w5
+    near += (load_from(across, at + 4 * PITCH) + load_from(across, at + 6 * PITCH)) * w4
+    near += (load_from(across, at + 3 * PITCH) + load_from(across, at + 7 * PITCH)) * w3
+    far = (load_from(across, at) + load_from(across, at + 10 * PITCH)) * w0
+    far += (load_from(across, at + PITCH) + load_from(across, at + 9 * PITCH)) * w1
+    far += (load_from(across, at + 2 * PITCH) + load_from(across, at + 8 * PITCH)) * w2
+    return near + far
 
 
-@njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def _clear(across, maps, row):  # type: ignore[no-untyped-def]
+    for j in range(maps):
+        for x in range(0, PITCH, LANES):
+            store_from(across, (j * ROWS + row) * PITCH + x, spread(F(0)))
+
+
+@njit(inline="always", error_model="numpy")
+def _place(job, height, width):  # type: ignore[no-untyped-def]
+    """A job's channel, first row, row after the last, first column, and width in whole vectors."""
+    across = (width + COLUMNS - 1) // COLUMNS
+    strips = (height + STRIP - 1) // STRIP
+    y0, x0 = job // across % strips * STRIP, job % across * COLUMNS
+    wide = min(COLUMNS, (width - x0 + LANES - 1) // LANES * LANES)
+    return job // across // strips, y0, min(height, y0 + STRIP), x0, wide
+
+
+@njit(inline="always", error_model="numpy")
+def _jobs(height, width):  # type: ignore[no-untyped-def]
+    return 3 * ((height + STRIP - 1) // STRIP) * ((width + COLUMNS - 1) // COLUMNS)
+
+
+@njit(error_model="numpy")
+def _forward_strip(  # type: ignore[no-untyped-def]
+    job, image, target, mask, target_mean, target_square, saturation, known, d_mean, d_square,
+    d_product, totals, across, parts,
+):  # fmt: skip
+    """One strip of one channel; `across` and `parts` are scratch."""
+    height, width = mask.shape[1], mask.shape[2]
+    channel, y0, y1, x0, wide = _place(job, height, width)
+    weights = _weights()
+    maps = 3 if known == 1 else 5
+    for row in range(y1 - y0 + 2 * HALF):
+        y = y0 - HALF + row
+        if y < 0 or y >= height:
+            _clear(across, maps, row)
+            continue
+        base = (channel * height + y) * width
+        p1 = t1 = spread(F(0))
+        for x in range(-LANES, wide, LANES):
+            # the vector at hand and the one after it
+            p0, t0 = p1, t1
+            u = x + LANES + x0 - HALF
+            p1 = load_part(image, base + u, -u, width - u)
+            t1 = load_part(target, base + u, -u, width - u)
+            m1 = load_part(mask, y * width + u, -u, width - u)
+            p1 = where((t1 >= saturation) & (p1 > t1), t1, p1) * m1
+            t1 = t1 * m1
+            if x < 0:
+                continue
+            at = row * PITCH + x
+            store_from(across, at, windowed(p0, p1, weights))
+            store_from(across, MAP + at, windowed(p0 * p0, p1 * p1, weights))
+            store_from(across, 2 * MAP + at, windowed(p0 * t0, p1 * t1, weights))
+            if known == 0:
+                store_from(across, 3 * MAP + at, windowed(t0, t1, weights))
+                store_from(across, 4 * MAP + at, windowed(t0 * t0, t1 * t1, weights))
+    total_ssim, total_l1, total_square = 0.0, 0.0, 0.0
+    one, two, zero = spread(F(1)), F(2), spread(F(0))
+    for row in range(y1 - y0):
+        y = y0 + row
+        base = (channel * height + y) * width
+        sum_ssim = sum_l1 = sum_square = zero
+        for x in range(0, wide, LANES):
+            u = x + x0
+            p = load_part(image, base + u, 0, width - u)
+            t = load_part(target, base + u, 0, width - u)
+            m = load_part(mask, y * width + u, 0, width - u)
+            at = row * PITCH + x
+            m1, mean_square = _down(across, at, weights), _down(across, MAP + at, weights)
+            product = _down(across, 2 * MAP + at, weights)
+            if known == 1:
+                m2 = load_part(target_mean, base + u, 0, width - u)
+                target_power = load_part(target_square, base + u, 0, width - u)
+            else:
+                m2 = _down(across, 3 * MAP + at, weights)
+                target_power = _down(across, 4 * MAP + at, weights)
+                store_part(target_mean, base + u, m2, width - u)
+                store_part(target_square, base + u, target_power, width - u)
+            m11, m22, m12 = m1 * m1, m2 * m2, m1 * m2
+            v1, v2 = mean_square - m11, target_power - m22
+            covariance = product - m12
+            inverse_a, inverse_b = one / (m11 + m22 + C1), one / (v1 + v2 + C2)
+            c, d = m12 * two + C1, covariance * two + C2
+            both = inverse_a * inverse_b
+            ssim = c * d * both
+            by_v1 = zero - ssim * inverse_b
+            by_covariance = c * both * two
+            by_mean = (m2 * d * both - m1 * (ssim * inverse_a + by_v1)) * two - m2 * by_covariance
+            store_part(d_mean, base + u, m * by_mean, width - u)
+            store_part(d_square, base + u, m * by_v1, width - u)
+            store_part(d_product, base + u, m * by_covariance, width - u)
+            error = where((t >= saturation) & (p > t), zero, p - t)
+            sum_ssim += m * ssim
+            sum_l1 += m * absolute(error)
+            sum_square += m * error * error
+        z = zero
+        store_from(
+            parts, 0, sums((sum_ssim, sum_l1, sum_square, z, z, z, z, z, z, z, z, z, z, z, z, z))
+        )
+        total_ssim += parts[0]
+        total_l1 += parts[1]
+        total_square += parts[2]
+    totals[job, 0] = total_ssim
+    totals[job, 1] = total_l1
+    totals[job, 2] = total_square
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
 def ssim_forward(  # type: ignore[no-untyped-def]
-    image: Floats, target: Floats, mask: Floats, target_mean: Floats, target_square: Floats,
-    known: int, d_mean: Floats, d_square: Floats, d_product: Floats, sums: npt.NDArray[np.float64],
+    workers: int, image: Floats, target: Floats, mask: Floats, target_mean: Floats,
+    target_square: Floats, saturation: np.float32, known: int, d_mean: Floats, d_square: Floats,
+    d_product: Floats, totals: npt.NDArray[np.float64],
 ):  # fmt: skip
     """SSIM and L1 sums per strip and channel, and the derivatives of SSIM by the window's moments.
 
     Args:
-        image: [>= 3, H, W], target: [3, H, W], mask: [H, W] 0 or 1.
+        workers: number of threads.
+        image: [>= 3, H, W], target: [3, H, W], mask: [1, H, W] 0 or 1.
+        saturation: where the target reaches it, a brighter image has no error.
         target_mean, target_square: [3, H, W] windowed moments of the target: read if `known`,
             else computed and stored.
         d_mean, d_square, d_product: [3, H, W] outputs: derivatives by E[x], E[x^2], E[x y].
-        sums: [3 * strips, 3] output: sum of SSIM, of |x - y|, of (x - y)^2 over valid pixels.
+        totals: [jobs, 3] output: sum of SSIM, of |x - y|, of (x - y)^2 over valid pixels.
     """
-    height, width = mask.shape
-    strips = (height + STRIP - 1) // STRIP
-    for job in prange(3 * strips):
-        channel = job // strips
-        y0 = (job % strips) * STRIP
-        y1 = min(height, y0 + STRIP)
-        rows = y1 - y0 + 2 * HALF
-        wide = (width + LANES - 1) // LANES * LANES
-        across = np.zeros((5, STRIP + 2 * HALF, wide), np.float32)
-        padded = np.zeros((5, wide + LANES), np.float32)
-        maps = 3 if known == 1 else 5
-        for row in range(rows):
-            y = y0 - HALF + row
-            if y < 0 or y >= height:
+    jobs = _jobs(mask.shape[1], mask.shape[2])
+    taken = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        across = np.zeros((5, ROWS, PITCH), np.float32)
+        parts = np.zeros(LANES, np.float32)
+        job = take_number(taken)
+        while job < jobs:
+            _forward_strip(
+                job, image, target, mask, target_mean, target_square, saturation, known, d_mean,
+                d_square, d_product, totals, across, parts,
+            )  # fmt: skip
+            job = take_number(taken)
+
+
+@njit(error_model="numpy")
+def _backward_strip(  # type: ignore[no-untyped-def]
+    job, image, target, mask, saturation, d_mean, d_square, d_product, l1_weight, ssim_weight,
+    d_image, across, parts,
+):  # fmt: skip
+    """One strip of one channel; `across` and `parts` are scratch."""
+    height, width = mask.shape[1], mask.shape[2]
+    channel, y0, y1, x0, wide = _place(job, height, width)
+    weights = _weights()
+    for row in range(y1 - y0 + 2 * HALF):
+        y = y0 - HALF + row
+        if y < 0 or y >= height:
+            _clear(across, 3, row)
+            continue
+        base = (channel * height + y) * width
+        a1 = b1 = c1 = spread(F(0))
+        for x in range(-LANES, wide, LANES):
+            a0, b0, c0 = a1, b1, c1
+            u = x + LANES + x0 - HALF
+            a1 = load_part(d_mean, base + u, -u, width - u)
+            b1 = load_part(d_square, base + u, -u, width - u)
+            c1 = load_part(d_product, base + u, -u, width - u)
+            if x < 0:
                 continue
-            for x in range(width):
-                m = mask[y, x]
-                p, t = image[channel, y, x] * m, target[channel, y, x] * m
-                padded[0, x + HALF] = p
-                padded[1, x + HALF] = p * p
-                padded[2, x + HALF] = p * t
-                padded[3, x + HALF] = t
-                padded[4, x + HALF] = t * t
-            for j in range(maps):
-                _blur(
-                    padded, j * (wide + LANES), 1,
-                    across, (j * (STRIP + 2 * HALF) + row) * wide, wide,
-                )  # fmt: skip
-        moments = np.zeros((5, wide), np.float32)
-        sums[job, 0] = sums[job, 1] = sums[job, 2] = 0.0
-        for row in range(y1 - y0):
-            y = y0 + row
-            for j in range(maps):
-                _blur(across, (j * (STRIP + 2 * HALF) + row) * wide, wide, moments, j * wide, wide)
-            if known == 1:
-                for x in range(width):
-                    moments[3, x] = target_mean[channel, y, x]
-                    moments[4, x] = target_square[channel, y, x]
-            else:
-                for x in range(width):
-                    target_mean[channel, y, x] = moments[3, x]
-                    target_square[channel, y, x] = moments[4, x]
-            row_ssim, row_l1, row_square = F(0), F(0), F(0)
-            for x in range(width):
-                m = mask[y, x]
-                m1, m2 = moments[0, x], moments[3, x]
-                v1, v2 = moments[1, x] - m1 * m1, moments[4, x] - m2 * m2
-                covariance = moments[2, x] - m1 * m2
-                inverse_a = F(1) / (m1 * m1 + m2 * m2 + C1)
-                inverse_b = F(1) / (v1 + v2 + C2)
-                c = F(2) * m1 * m2 + C1
-                d = F(2) * covariance + C2
-                ssim = c * d * inverse_a * inverse_b
-                by_v1 = -ssim * inverse_b
-                by_covariance = F(2) * c * inverse_a * inverse_b
-                d_mean[channel, y, x] = m * (
-                    F(2) * m2 * d * inverse_a * inverse_b
-                    - F(2) * m1 * ssim * inverse_a
-                    - F(2) * m1 * by_v1
-                    - m2 * by_covariance
-                )
-                d_square[channel, y, x] = m * by_v1
-                d_product[channel, y, x] = m * by_covariance
-                error = image[channel, y, x] - target[channel, y, x]
-                row_ssim += m * ssim
-                row_l1 += m * abs(error)
-                row_square += m * error * error
-            sums[job, 0] += row_ssim
-            sums[job, 1] += row_l1
-            sums[job, 2] += row_square
+            at = row * PITCH + x
+            store_from(across, at, windowed(a0, a1, weights))
+            store_from(across, MAP + at, windowed(b0, b1, weights))
+            store_from(across, 2 * MAP + at, windowed(c0, c1, weights))
+    zero = spread(F(0))
+    for row in range(y1 - y0):
+        y = y0 + row
+        base = (channel * height + y) * width
+        for x in range(0, wide, LANES):
+            u = x + x0
+            p = load_part(image, base + u, 0, width - u)
+            t = load_part(target, base + u, 0, width - u)
+            m = load_part(mask, y * width + u, 0, width - u)
+            at = row * PITCH + x
+            counts = where((t >= saturation) & (p > t), zero, m)
+            sign = where(p > t, spread(l1_weight), zero) - where(t > p, spread(l1_weight), zero)
+            by_ssim = _down(across, at, weights) + p * _down(across, MAP + at, weights) * F(2)
+            by_ssim += t * _down(across, 2 * MAP + at, weights)
+            store_part(d_image, base + u, counts * (sign - by_ssim * ssim_weight), width - u)
 
 
-@njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@njit(parallel=True, cache=True, error_model="numpy")
 def ssim_backward(  # type: ignore[no-untyped-def]
-    image: Floats, target: Floats, mask: Floats, d_mean: Floats, d_square: Floats,
-    d_product: Floats, l1_weight: np.float32, ssim_weight: np.float32, d_image: Floats,
+    workers: int, image: Floats, target: Floats, mask: Floats, saturation: np.float32,
+    d_mean: Floats, d_square: Floats, d_product: Floats, l1_weight: np.float32,
+    ssim_weight: np.float32, d_image: Floats,
 ):  # fmt: skip
     """Gradient of l1_weight * sum|x - y| - ssim_weight * sum(SSIM) into `d_image` [>= 3, H, W]."""
-    height, width = mask.shape
-    strips = (height + STRIP - 1) // STRIP
-    for job in prange(3 * strips):
-        channel = job // strips
-        y0 = (job % strips) * STRIP
-        y1 = min(height, y0 + STRIP)
-        rows = y1 - y0 + 2 * HALF
-        wide = (width + LANES - 1) // LANES * LANES
-        across = np.zeros((3, STRIP + 2 * HALF, wide), np.float32)
-        padded = np.zeros((3, wide + LANES), np.float32)
-        moments = np.zeros((3, wide), np.float32)
-        for row in range(rows):
-            y = y0 - HALF + row
-            if y < 0 or y >= height:
-                continue
-            for x in range(width):
-                padded[0, x + HALF] = d_mean[channel, y, x]
-                padded[1, x + HALF] = d_square[channel, y, x]
-                padded[2, x + HALF] = d_product[channel, y, x]
-            for j in range(3):
-                _blur(
-                    padded, j * (wide + LANES), 1,
-                    across, (j * (STRIP + 2 * HALF) + row) * wide, wide,
-                )  # fmt: skip
-        for row in range(y1 - y0):
-            y = y0 + row
-            for j in range(3):
-                _blur(across, (j * (STRIP + 2 * HALF) + row) * wide, wide, moments, j * wide, wide)
-            for x in range(width):
-                p, t = image[channel, y, x], target[channel, y, x]
-                sign = F(1) if p > t else (F(-1) if p < t else F(0))
-                d_image[channel, y, x] = mask[y, x] * (
-                    l1_weight * sign
-                    - ssim_weight * (moments[0, x] + F(2) * p * moments[1, x] + t * moments[2, x])
-                )
+    jobs = _jobs(mask.shape[1], mask.shape[2])
+    taken = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        across = np.zeros((3, ROWS, PITCH), np.float32)
+        parts = np.zeros(LANES, np.float32)
+        job = take_number(taken)
+        while job < jobs:
+            _backward_strip(
+                job, image, target, mask, saturation, d_mean, d_square, d_product, l1_weight,
+                ssim_weight, d_image, across, parts,
+            )  # fmt: skip
+            job = take_number(taken)
 
 
 @dataclass
@@ -187,30 +284,37 @@ class ColourLoss:
     def __post_init__(self) -> None:
         self.valid = max(float(self.mask.sum(dtype=np.float64)), 1.0)
 
-    def __call__(self, image: Floats, lambda_dssim: float) -> ColourLossResult:
-        """Loss, its gradient, PSNR and SSIM for an image [>= 3, H, W]."""
-        with KERNELS:
-            return self._compare(image, lambda_dssim)
+    def __call__(
+        self, image: Floats, lambda_dssim: float, saturation: float = np.inf
+    ) -> ColourLossResult:
+        """Loss, its gradient, PSNR and SSIM for an image [>= 3, H, W].
 
-    def _compare(self, image: Floats, lambda_dssim: float) -> ColourLossResult:
-        height = self.mask.shape[0]
+        What a camera clips may be brighter: where the target reaches `saturation` and the image is
+        brighter still, there is no error and no gradient.
+        """
+        with KERNELS:
+            return self._compare(image, lambda_dssim, F(min(saturation, MOST)))
+
+    def _compare(
+        self, image: Floats, lambda_dssim: float, saturation: np.float32
+    ) -> ColourLossResult:
         known = self._moments is not None
         if self._moments is None:
             self._moments = (np.empty_like(self.target), np.empty_like(self.target))
         by_mean, by_square, by_product = (np.empty_like(self.target) for _ in range(3))
-        strips = -(-height // STRIP)
-        sums = np.empty((3 * strips, 3))
+        height, width = self.mask.shape
+        totals = np.empty((3 * -(-height // STRIP) * -(-width // COLUMNS), 3))
         ssim_forward(
-            image, self.target, self.mask, *self._moments, int(known),
-            by_mean, by_square, by_product, sums,
+            workers(), image, self.target, self.mask[None], *self._moments, saturation, int(known),
+            by_mean, by_square, by_product, totals,
         )  # fmt: skip
         count = 3 * self.valid
         # the strips' sums in a fixed order
-        ssim, l1, square = (float(sums[:, k].sum()) / count for k in range(3))
+        ssim, l1, square = (float(totals[:, k].sum()) / count for k in range(3))
         gradient = np.empty_like(self.target)
         ssim_backward(
-            image, self.target, self.mask, by_mean, by_square, by_product,
-            F((1 - lambda_dssim) / count), F(lambda_dssim / count), gradient,
+            workers(), image, self.target, self.mask[None], saturation, by_mean, by_square,
+            by_product, F((1 - lambda_dssim) / count), F(lambda_dssim / count), gradient,
         )  # fmt: skip
         loss = (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim)
         psnr = float(-10 * np.log10(max(square, 1e-12)))

@@ -4,11 +4,13 @@ A scene is one packed matrix [N, 11 + 3 K] float32 (K = spherical-harmonics coef
 
     0:3 mean | 3:7 quaternion wxyz | 7:10 log scale | 10 logit opacity | 11: harmonics, K x 3
 
-and a projected Gaussian is one row of `screen` [N, 12] float32:
+and a projected Gaussian is one row of `screen` [N, 16] float32:
 
     0:2 centre (px) | 2:5 inverse 2D covariance a, b, c | 5 opacity, compensated if antialiased |
     6:8 half width, half height of the ellipse where alpha falls below its cut (px; negative: not
-    visible) | 8 depth z | 9 inverse of the variance along y | 10 log2 of the opacity | 11 b / a
+    visible) | 8 depth z | 9 inverse of the variance along y | 10 log2 of the opacity | 11 b / a |
+    12 height of the ellipse's rightmost point above the centre | 13 1 / a | 14:16 nothing: a row is
+    a cache line
 
 Every kernel works in chunks of fixed length, so that its result does not depend on the number of
 threads (a vectorised loop may round differently from its scalar remainder). The functions that a
@@ -23,39 +25,48 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting.lane_types import WIDTH as LANES
+from stages.splatting.lanes import (
+    at_least,
+    at_most,
+    exponential,
+    load_from,
+    log2,
+    root,
+    spread,
+    store_from,
+    sums,
+    where,
+)
+
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 F = np.float32
 
 #: first column of the harmonics in the packed matrix
 HARMONICS = 11
-SCREEN_COLUMNS = 12
+SCREEN_COLUMNS = 16
 #: Gaussians per chunk
 CHUNK = 256
 #: columns of a row of screen gradients: centre 2, conic 3, opacity, |centre| 2; then the features
 SCREEN_GRADIENTS = 8
 #: columns of the gradient of a camera: twist (translation 3, rotation 3), fx, fy, cx, cy
 CAMERA_GRADIENTS = 10
+TWO_LN2 = F(2 * math.log(2))
 
 
-@njit(error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _rotation(qw, qx, qy, qz):  # type: ignore[no-untyped-def]
-    """Rotation matrix of a unit quaternion, row by row."""
+    """Rotation matrices of quaternions, row by row, and 1 / their lengths."""
     one, two = F(1), F(2)
+    norm = one / root(qw * qw + qx * qx + qy * qy + qz * qz)
+    qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
     return (
         one - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy),
         two * (qx * qy + qw * qz), one - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx),
         two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), one - two * (qx * qx + qy * qy),
+        norm,
     )  # fmt: skip
-
-
-@njit(error_model="numpy")
-def _to_camera(pose, x, y, z):  # type: ignore[no-untyped-def]
-    return (
-        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
-        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
-        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
-    )
 
 
 @njit(error_model="numpy")
@@ -75,7 +86,7 @@ def project_forward(  # type: ignore[no-untyped-def]
     near: np.float32, low_pass: np.float32, alpha_cut: np.float32, antialiased: int,
     screen: Floats,
 ):  # fmt: skip
-    """Project every Gaussian; fills `screen` [N, 12].
+    """Project every Gaussian; fills `screen` [N, 16].
 
     Args:
         packed: [N, 11 + 3 K] scene.
@@ -91,35 +102,41 @@ def project_forward(  # type: ignore[no-untyped-def]
     number = packed.shape[0]
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     left, right, top, bottom = _slope_limits(intrinsics, width, height)
+    p00, p01, p02, p03 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    p10, p11, p12, p13 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    p20, p21, p22, p23 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    log_cut = math.log2(alpha_cut)
+    one, zero = F(1), spread(F(0))
     for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            screen[i, 6] = F(-1)
-            px, py, pz = _to_camera(pose, packed[i, 0], packed[i, 1], packed[i, 2])
-            screen[i, 8] = pz
+        start, end = chunk * CHUNK, min(number, (chunk + 1) * CHUNK)
+        # the chunk's columns as rows, 16 Gaussians a vector
+        given = np.zeros((HARMONICS, CHUNK), np.float32)
+        result = np.zeros((SCREEN_COLUMNS, CHUNK), np.float32)
+        for i in range(end - start):
+            for column in range(HARMONICS):
+                given[column, i] = packed[start + i, column]
+        for k in range(0, end - start, LANES):
+            x, y = load_from(given, k), load_from(given, CHUNK + k)
+            z = load_from(given, 2 * CHUNK + k)
+            px = p00 * x + p01 * y + p02 * z + p03
+            py = p10 * x + p11 * y + p12 * z + p13
+            pz = p20 * x + p21 * y + p22 * z + p23
+            opacity = one / (exponential(zero - load_from(given, 10 * CHUNK + k)) + one)
             # written so that a NaN fails the test
-            if not pz > near:
-                continue
-            opacity = F(1) / (F(1) + math.exp(-packed[i, 10]))
-            if not opacity > alpha_cut:
-                continue
-            qw, qx, qy, qz = packed[i, 3], packed[i, 4], packed[i, 5], packed[i, 6]
-            norm = F(1) / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(
-                qw * norm, qx * norm, qy * norm, qz * norm
-            )
-            s0, s1, s2 = math.exp(packed[i, 7]), math.exp(packed[i, 8]), math.exp(packed[i, 9])
-            inverse_z = F(1) / pz
-            tx = min(right, max(left, px * inverse_z))
-            ty = min(bottom, max(top, py * inverse_z))
-            j00, j02 = fx * inverse_z, -fx * tx * inverse_z
-            j11, j12 = fy * inverse_z, -fy * ty * inverse_z
+            visible = (pz > near) & (opacity > alpha_cut)
+            iz = one / where(visible, pz, one)
+            qw, qx = load_from(given, 3 * CHUNK + k), load_from(given, 4 * CHUNK + k)
+            qy, qz = load_from(given, 5 * CHUNK + k), load_from(given, 6 * CHUNK + k)
+            r00, r01, r02, r10, r11, r12, r20, r21, r22, _ = _rotation(qw, qx, qy, qz)
+            s0 = exponential(load_from(given, 7 * CHUNK + k))
+            s1 = exponential(load_from(given, 8 * CHUNK + k))
+            s2 = exponential(load_from(given, 9 * CHUNK + k))
+            tx = at_most(at_least(px * iz, left), right)
+            ty = at_most(at_least(py * iz, top), bottom)
+            j00, j02, j11, j12 = iz * fx, tx * iz * -fx, iz * fy, ty * iz * -fy
             # rows of J W, then of J W R S, whose product with its transpose is the 2D covariance
-            w00 = j00 * pose[0, 0] + j02 * pose[2, 0]
-            w01 = j00 * pose[0, 1] + j02 * pose[2, 1]
-            w02 = j00 * pose[0, 2] + j02 * pose[2, 2]
-            w10 = j11 * pose[1, 0] + j12 * pose[2, 0]
-            w11 = j11 * pose[1, 1] + j12 * pose[2, 1]
-            w12 = j11 * pose[1, 2] + j12 * pose[2, 2]
+            w00, w01, w02 = j00 * p00 + j02 * p20, j00 * p01 + j02 * p21, j00 * p02 + j02 * p22
+            w10, w11, w12 = j11 * p10 + j12 * p20, j11 * p11 + j12 * p21, j11 * p12 + j12 * p22
             a00 = (w00 * r00 + w01 * r10 + w02 * r20) * s0
             a01 = (w00 * r01 + w01 * r11 + w02 * r21) * s1
             a02 = (w00 * r02 + w01 * r12 + w02 * r22) * s2
@@ -131,39 +148,40 @@ def project_forward(  # type: ignore[no-untyped-def]
             yy = a10 * a10 + a11 * a11 + a12 * a12
             # |a0 x a1|^2 is the determinant without the low-pass; the direct form loses all its
             # digits for a long thin Gaussian
-            n0 = a01 * a12 - a02 * a11
-            n1 = a02 * a10 - a00 * a12
-            n2 = a00 * a11 - a01 * a10
+            n0, n1, n2 = a01 * a12 - a02 * a11, a02 * a10 - a00 * a12, a00 * a11 - a01 * a10
             sharp = n0 * n0 + n1 * n1 + n2 * n2
             determinant = sharp + low_pass * (xx + yy + low_pass)
             xx += low_pass
             yy += low_pass
-            if not (determinant > F(1e-12) and determinant < F(1e30)):
-                continue
+            visible = visible & (determinant > F(1e-12)) & (determinant < F(1e30))
             if antialiased == 1:
-                opacity *= math.sqrt(sharp / determinant)
-                if not opacity > alpha_cut:
-                    continue
-            u, v = fx * px * inverse_z + cx, fy * py * inverse_z + cy
-            reach = F(2) * math.log(opacity / alpha_cut)
-            half_width, half_height = math.sqrt(reach * xx), math.sqrt(reach * yy)
-            if not (
-                u + half_width > F(0) and u - half_width < F(width)
-                and v + half_height > F(0) and v - half_height < F(height)
-            ):  # fmt: skip
-                continue
-            inverse = F(1) / determinant
-            screen[i, 0] = u
-            screen[i, 1] = v
-            screen[i, 2] = yy * inverse
-            screen[i, 3] = -xy * inverse
-            screen[i, 4] = xx * inverse
-            screen[i, 5] = opacity
-            screen[i, 6] = half_width
-            screen[i, 7] = half_height
-            screen[i, 9] = F(1) / yy
-            screen[i, 10] = math.log2(opacity)
-            screen[i, 11] = -xy / yy
+                opacity = opacity * root(sharp / determinant)
+                visible = visible & (opacity > alpha_cut)
+            opacity = where(visible, opacity, one)
+            u, v = px * iz * fx + cx, py * iz * fy + cy
+            log_opacity = log2(opacity)
+            reach = (log_opacity - log_cut) * TWO_LN2
+            half_width, half_height = root(reach * xx), root(reach * yy)
+            visible = visible & (u + half_width > zero) & (u - half_width < F(width))
+            visible = visible & (v + half_height > zero) & (v - half_height < F(height))
+            inverse = one / determinant
+            store_from(result, k, u)
+            store_from(result, CHUNK + k, v)
+            store_from(result, 2 * CHUNK + k, yy * inverse)
+            store_from(result, 3 * CHUNK + k, zero - xy * inverse)
+            store_from(result, 4 * CHUNK + k, xx * inverse)
+            store_from(result, 5 * CHUNK + k, opacity)
+            store_from(result, 6 * CHUNK + k, where(visible, half_width, F(-1)))
+            store_from(result, 7 * CHUNK + k, half_height)
+            store_from(result, 8 * CHUNK + k, pz)
+            store_from(result, 9 * CHUNK + k, one / yy)
+            store_from(result, 10 * CHUNK + k, log_opacity)
+            store_from(result, 11 * CHUNK + k, zero - xy / yy)
+            store_from(result, 12 * CHUNK + k, half_width * xy / xx)
+            store_from(result, 13 * CHUNK + k, determinant / yy)
+        for i in range(end - start):
+            for column in range(SCREEN_COLUMNS):
+                screen[start + i, column] = result[column, i]
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -185,50 +203,75 @@ def project_backward(  # type: ignore[no-untyped-def]
     number = packed.shape[0]
     fx, fy = intrinsics[0], intrinsics[1]
     left, right, top, bottom = _slope_limits(intrinsics, width, height)
-    two = F(2)
+    p00, p01, p02, p03 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    p10, p11, p12, p13 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    p20, p21, p22, p23 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    one, two, zero = F(1), F(2), spread(F(0))
     for chunk in prange((number + CHUNK - 1) // CHUNK):
-        camera = np.zeros(CAMERA_GRADIENTS, np.float32)
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+        start, end = chunk * CHUNK, min(number, (chunk + 1) * CHUNK)
+        # the chunk's columns as rows, 16 Gaussians a vector
+        given = np.zeros((HARMONICS, CHUNK), np.float32)
+        shown = np.zeros((6, CHUNK), np.float32)
+        wanted = np.zeros((6, CHUNK), np.float32)
+        result = np.empty((HARMONICS, CHUNK), np.float32)
+        for i in range(end - start):
+            row = start + i
             for column in range(HARMONICS):
-                gradient[i, column] = F(0)
-            if screen[i, 6] < F(0):
-                continue
-            px, py, pz = _to_camera(pose, packed[i, 0], packed[i, 1], packed[i, 2])
-            qw, qx, qy, qz = packed[i, 3], packed[i, 4], packed[i, 5], packed[i, 6]
-            norm = F(1) / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+                given[column, i] = packed[row, column]
+            for column in range(6):
+                shown[column, i] = screen[row, 2 + column]
+                wanted[column, i] = screen_gradient[row, column]
+        for i in range(end - start, CHUNK):
+            shown[4, i] = F(-1)
+        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = c9 = zero
+        for k in range(0, end - start, LANES):
+            visible = load_from(shown, 4 * CHUNK + k) >= F(0)
+            x, y, z = (
+                load_from(given, k),
+                load_from(given, CHUNK + k),
+                load_from(given, 2 * CHUNK + k),
+            )
+            px = p00 * x + p01 * y + p02 * z + p03
+            py = p10 * x + p11 * y + p12 * z + p13
+            pz = where(visible, p20 * x + p21 * y + p22 * z + p23, one)
+            qw = where(visible, load_from(given, 3 * CHUNK + k), one)
+            qx, qy = load_from(given, 4 * CHUNK + k), load_from(given, 5 * CHUNK + k)
+            qz = load_from(given, 6 * CHUNK + k)
+            r00, r01, r02, r10, r11, r12, r20, r21, r22, norm = _rotation(qw, qx, qy, qz)
             qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(qw, qx, qy, qz)
-            s0, s1, s2 = math.exp(packed[i, 7]), math.exp(packed[i, 8]), math.exp(packed[i, 9])
-            iz = F(1) / pz
+            s0 = exponential(load_from(given, 7 * CHUNK + k))
+            s1 = exponential(load_from(given, 8 * CHUNK + k))
+            s2 = exponential(load_from(given, 9 * CHUNK + k))
+            iz = one / pz
             slope_x, slope_y = px * iz, py * iz
-            tx, ty = min(right, max(left, slope_x)), min(bottom, max(top, slope_y))
-            j00, j02, j11, j12 = fx * iz, -fx * tx * iz, fy * iz, -fy * ty * iz
+            tx = at_most(at_least(slope_x, left), right)
+            ty = at_most(at_least(slope_y, top), bottom)
+            j00, j02, j11, j12 = iz * fx, tx * iz * -fx, iz * fy, ty * iz * -fy
             # B = W R S (the Gaussian's axes in the camera), A = J B
             m00, m01, m02 = r00 * s0, r01 * s1, r02 * s2
             m10, m11, m12 = r10 * s0, r11 * s1, r12 * s2
             m20, m21, m22 = r20 * s0, r21 * s1, r22 * s2
-            b00 = pose[0, 0] * m00 + pose[0, 1] * m10 + pose[0, 2] * m20
-            b01 = pose[0, 0] * m01 + pose[0, 1] * m11 + pose[0, 2] * m21
-            b02 = pose[0, 0] * m02 + pose[0, 1] * m12 + pose[0, 2] * m22
-            b10 = pose[1, 0] * m00 + pose[1, 1] * m10 + pose[1, 2] * m20
-            b11 = pose[1, 0] * m01 + pose[1, 1] * m11 + pose[1, 2] * m21
-            b12 = pose[1, 0] * m02 + pose[1, 1] * m12 + pose[1, 2] * m22
-            b20 = pose[2, 0] * m00 + pose[2, 1] * m10 + pose[2, 2] * m20
-            b21 = pose[2, 0] * m01 + pose[2, 1] * m11 + pose[2, 2] * m21
-            b22 = pose[2, 0] * m02 + pose[2, 1] * m12 + pose[2, 2] * m22
+            b00 = p00 * m00 + p01 * m10 + p02 * m20
+            b01 = p00 * m01 + p01 * m11 + p02 * m21
+            b02 = p00 * m02 + p01 * m12 + p02 * m22
+            b10 = p10 * m00 + p11 * m10 + p12 * m20
+            b11 = p10 * m01 + p11 * m11 + p12 * m21
+            b12 = p10 * m02 + p11 * m12 + p12 * m22
+            b20 = p20 * m00 + p21 * m10 + p22 * m20
+            b21 = p20 * m01 + p21 * m11 + p22 * m21
+            b22 = p20 * m02 + p21 * m12 + p22 * m22
             a00, a01, a02 = j00 * b00 + j02 * b20, j00 * b01 + j02 * b21, j00 * b02 + j02 * b22
             a10, a11, a12 = j11 * b10 + j12 * b20, j11 * b11 + j12 * b21, j11 * b12 + j12 * b22
 
             # conic -> covariance: dL/dSigma = -Q (dL/dQ) Q
-            qa, qb, qc = screen[i, 2], screen[i, 3], screen[i, 4]
-            ga, gb, gc = (
-                screen_gradient[i, 2],
-                F(0.5) * screen_gradient[i, 3],
-                screen_gradient[i, 4],
-            )
+            qa, qb = load_from(shown, k), load_from(shown, CHUNK + k)
+            qc, opacity = load_from(shown, 2 * CHUNK + k), load_from(shown, 3 * CHUNK + k)
+            ga, gb = load_from(wanted, 2 * CHUNK + k), load_from(wanted, 3 * CHUNK + k) * F(0.5)
+            gc = load_from(wanted, 4 * CHUNK + k)
             e00, e01 = ga * qa + gb * qb, ga * qb + gb * qc
             e10, e11 = gb * qa + gc * qb, gb * qb + gc * qc
-            dxx, dxy, dyy = -(qa * e00 + qb * e10), -(qa * e01 + qb * e11), -(qb * e01 + qc * e11)
+            dxx = zero - (qa * e00 + qb * e10)
+            dxy, dyy = zero - (qa * e01 + qb * e11), zero - (qb * e01 + qc * e11)
             da00, da01, da02 = (
                 two * (dxx * a00 + dxy * a10), two * (dxx * a01 + dxy * a11),
                 two * (dxx * a02 + dxy * a12),
@@ -237,7 +280,7 @@ def project_backward(  # type: ignore[no-untyped-def]
                 two * (dxy * a00 + dyy * a10), two * (dxy * a01 + dyy * a11),
                 two * (dxy * a02 + dyy * a12),
             )  # fmt: skip
-            faded = screen_gradient[i, 5] * screen[i, 5]
+            faded = load_from(wanted, 5 * CHUNK + k) * opacity
             if antialiased == 1:
                 # opacity = sigmoid * |n| / sqrt(det), n = a0 x a1, det = |n|^2 + low-pass part
                 n0, n1, n2 = a01 * a12 - a02 * a11, a02 * a10 - a00 * a12, a00 * a11 - a01 * a10
@@ -246,7 +289,7 @@ def project_backward(  # type: ignore[no-untyped-def]
                 determinant = sharp + low_pass * (trace + low_pass)
                 # d log(opacity) = by_n d|n|^2 / 2 - by_trace d(trace) / 2
                 by_trace = faded * low_pass / determinant
-                by_n = by_trace * (trace + low_pass) / max(sharp, F(1e-30))
+                by_n = by_trace * (trace + low_pass) / at_least(sharp, F(1e-30))
                 da00 += by_n * (a11 * n2 - a12 * n1) - by_trace * a00
                 da01 += by_n * (a12 * n0 - a10 * n2) - by_trace * a01
                 da02 += by_n * (a10 * n1 - a11 * n0) - by_trace * a02
@@ -263,18 +306,18 @@ def project_backward(  # type: ignore[no-untyped-def]
                 j02 * da00 + j12 * da10, j02 * da01 + j12 * da11, j02 * da02 + j12 * da12
             )  # fmt: skip
             # d(R S) = W^T dB
-            dm00 = pose[0, 0] * db00 + pose[1, 0] * db10 + pose[2, 0] * db20
-            dm01 = pose[0, 0] * db01 + pose[1, 0] * db11 + pose[2, 0] * db21
-            dm02 = pose[0, 0] * db02 + pose[1, 0] * db12 + pose[2, 0] * db22
-            dm10 = pose[0, 1] * db00 + pose[1, 1] * db10 + pose[2, 1] * db20
-            dm11 = pose[0, 1] * db01 + pose[1, 1] * db11 + pose[2, 1] * db21
-            dm12 = pose[0, 1] * db02 + pose[1, 1] * db12 + pose[2, 1] * db22
-            dm20 = pose[0, 2] * db00 + pose[1, 2] * db10 + pose[2, 2] * db20
-            dm21 = pose[0, 2] * db01 + pose[1, 2] * db11 + pose[2, 2] * db21
-            dm22 = pose[0, 2] * db02 + pose[1, 2] * db12 + pose[2, 2] * db22
-            gradient[i, 7] = (dm00 * r00 + dm10 * r10 + dm20 * r20) * s0
-            gradient[i, 8] = (dm01 * r01 + dm11 * r11 + dm21 * r21) * s1
-            gradient[i, 9] = (dm02 * r02 + dm12 * r12 + dm22 * r22) * s2
+            dm00 = p00 * db00 + p10 * db10 + p20 * db20
+            dm01 = p00 * db01 + p10 * db11 + p20 * db21
+            dm02 = p00 * db02 + p10 * db12 + p20 * db22
+            dm10 = p01 * db00 + p11 * db10 + p21 * db20
+            dm11 = p01 * db01 + p11 * db11 + p21 * db21
+            dm12 = p01 * db02 + p11 * db12 + p21 * db22
+            dm20 = p02 * db00 + p12 * db10 + p22 * db20
+            dm21 = p02 * db01 + p12 * db11 + p22 * db21
+            dm22 = p02 * db02 + p12 * db12 + p22 * db22
+            store_from(result, 7 * CHUNK + k, (dm00 * r00 + dm10 * r10 + dm20 * r20) * s0)
+            store_from(result, 8 * CHUNK + k, (dm01 * r01 + dm11 * r11 + dm21 * r21) * s1)
+            store_from(result, 9 * CHUNK + k, (dm02 * r02 + dm12 * r12 + dm22 * r22) * s2)
             dm00, dm10, dm20 = dm00 * s0, dm10 * s0, dm20 * s0
             dm01, dm11, dm21 = dm01 * s1, dm11 * s1, dm21 * s1
             dm02, dm12, dm22 = dm02 * s2, dm12 * s2, dm22 * s2
@@ -292,48 +335,62 @@ def project_backward(  # type: ignore[no-untyped-def]
                 - two * qz * (dm00 + dm11)
             )  # fmt: skip
             along = dqw * qw + dqx * qx + dqy * qy + dqz * qz
-            gradient[i, 3] = (dqw - along * qw) * norm
-            gradient[i, 4] = (dqx - along * qx) * norm
-            gradient[i, 5] = (dqy - along * qy) * norm
-            gradient[i, 6] = (dqz - along * qz) * norm
-            gradient[i, 10] = faded / (F(1) + math.exp(packed[i, 10]))
+            store_from(result, 3 * CHUNK + k, (dqw - along * qw) * norm)
+            store_from(result, 4 * CHUNK + k, (dqx - along * qx) * norm)
+            store_from(result, 5 * CHUNK + k, (dqy - along * qy) * norm)
+            store_from(result, 6 * CHUNK + k, (dqz - along * qz) * norm)
+            logit = load_from(given, 10 * CHUNK + k)
+            store_from(result, 10 * CHUNK + k, faded / (exponential(logit) + one))
 
             # centre in the camera: through u, v, and through the Jacobian
-            gu, gv = screen_gradient[i, 0], screen_gradient[i, 1]
+            gu, gv = load_from(wanted, k), load_from(wanted, CHUNK + k)
             dpx, dpy = gu * fx * iz, gv * fy * iz
-            dpz = -(gu * fx * px + gv * fy * py) * iz * iz
+            dpz = zero - (gu * fx * px + gv * fy * py) * iz * iz
             dpz -= (dj00 * j00 + dj02 * j02 + dj11 * j11 + dj12 * j12) * iz
             dfx = gu * slope_x + dj00 * iz
             dfy = gv * slope_y + dj11 * iz
-            dcx, dcy = gu, gv
-            if left < slope_x < right:
-                dpx -= dj02 * fx * iz * iz
-                dpz += dj02 * fx * slope_x * iz * iz
-                dfx -= dj02 * tx * iz
-            else:
-                # held at the border, whose distance from the principal point is in pixels
-                dcx += dj02 * iz
-            if top < slope_y < bottom:
-                dpy -= dj12 * fy * iz * iz
-                dpz += dj12 * fy * slope_y * iz * iz
-                dfy -= dj12 * ty * iz
-            else:
-                dcy += dj12 * iz
-            gradient[i, 0] = pose[0, 0] * dpx + pose[1, 0] * dpy + pose[2, 0] * dpz
-            gradient[i, 1] = pose[0, 1] * dpx + pose[1, 1] * dpy + pose[2, 1] * dpz
-            gradient[i, 2] = pose[0, 2] * dpx + pose[1, 2] * dpy + pose[2, 2] * dpz
-            camera[0] += dpx
-            camera[1] += dpy
-            camera[2] += dpz
-            camera[3] += py * dpz - pz * dpy
-            camera[3] += b10 * db20 - b20 * db10 + b11 * db21 - b21 * db11 + b12 * db22 - b22 * db12
-            camera[4] += pz * dpx - px * dpz
-            camera[4] += b20 * db00 - b00 * db20 + b21 * db01 - b01 * db21 + b22 * db02 - b02 * db22
-            camera[5] += px * dpy - py * dpx
-            camera[5] += b00 * db10 - b10 * db00 + b01 * db11 - b11 * db01 + b02 * db12 - b12 * db02
-            camera[6] += dfx
-            camera[7] += dfy
-            camera[8] += dcx
-            camera[9] += dcy
-        for k in range(CAMERA_GRADIENTS):
-            camera_parts[chunk, k] = camera[k]
+            # at the border the slope is held, whose distance from the principal point is in pixels
+            free = (slope_x > left) & (slope_x < right)
+            inner, outer = where(free, dj02 * iz, zero), where(free, zero, dj02 * iz)
+            dpx -= inner * fx * iz
+            dpz += inner * fx * slope_x * iz
+            dfx -= inner * tx
+            dcx = gu + outer
+            free = (slope_y > top) & (slope_y < bottom)
+            inner, outer = where(free, dj12 * iz, zero), where(free, zero, dj12 * iz)
+            dpy -= inner * fy * iz
+            dpz += inner * fy * slope_y * iz
+            dfy -= inner * ty
+            dcy = gv + outer
+            store_from(result, k, p00 * dpx + p10 * dpy + p20 * dpz)
+            store_from(result, CHUNK + k, p01 * dpx + p11 * dpy + p21 * dpz)
+            store_from(result, 2 * CHUNK + k, p02 * dpx + p12 * dpy + p22 * dpz)
+            twist0 = py * dpz - pz * dpy
+            twist0 += b10 * db20 - b20 * db10 + b11 * db21 - b21 * db11 + b12 * db22 - b22 * db12
+            twist1 = pz * dpx - px * dpz
+            twist1 += b20 * db00 - b00 * db20 + b21 * db01 - b01 * db21 + b22 * db02 - b02 * db22
+            twist2 = px * dpy - py * dpx
+            twist2 += b00 * db10 - b10 * db00 + b01 * db11 - b11 * db01 + b02 * db12 - b12 * db02
+            c0 += where(visible, dpx, zero)
+            c1 += where(visible, dpy, zero)
+            c2 += where(visible, dpz, zero)
+            c3 += where(visible, twist0, zero)
+            c4 += where(visible, twist1, zero)
+            c5 += where(visible, twist2, zero)
+            c6 += where(visible, dfx, zero)
+            c7 += where(visible, dfy, zero)
+            c8 += where(visible, dcx, zero)
+            c9 += where(visible, dcy, zero)
+        for i in range(end - start):
+            row = start + i
+            seen = shown[4, i] >= F(0)
+            for column in range(HARMONICS):
+                gradient[row, column] = result[column, i] if seen else F(0)
+        total = np.empty(LANES, np.float32)
+        store_from(
+            total,
+            0,
+            sums((c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, zero, zero, zero, zero, zero, zero)),
+        )
+        for column in range(CAMERA_GRADIENTS):
+            camera_parts[chunk, column] = total[column]

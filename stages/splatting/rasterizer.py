@@ -31,9 +31,8 @@ from stages.splatting.raster import (
     composite_backward,
     composite_forward,
     slot_columns,
-    tile_stride,
 )
-from stages.splatting.threads import KERNELS, use_threads
+from stages.splatting.threads import KERNELS, use_threads, workers
 from stages.splatting.tiles import TILE, count_tiles, fill_tiles, list_tiles, order_by_depth
 
 __all__ = ["Gradients", "Rendering", "Viewpoint", "pack", "rasterize", "unpack", "use_threads"]
@@ -154,8 +153,7 @@ class _Pass:
     first_slot: Ints
     slots: Ints
     stop: Ints
-    end: Ints
-    spans: Ints
+    blocks: npt.NDArray[np.int64]
     features: Floats
 
 
@@ -167,7 +165,7 @@ class Rendering:
         planes: [C, H, W] float32, composited and not divided by alpha: colour 3 (with harmonics),
             depth 1 and flow 2 (where asked for), then the given features.
         transmittance: [H, W] float32, 1 - alpha.
-        screen: [N, 12] float32 projected Gaussians (see `projection`).
+        screen: [N, 16] float32 projected Gaussians (see `projection`).
     """
 
     planes: Floats
@@ -206,13 +204,13 @@ class Rendering:
         width = SCREEN_GRADIENTS + padded
         slot_sums = aligned_empty(len(f.members), slot_columns(padded))
         composite_backward(
-            f.tiles_x, f.tiles_y, tile_stride(f.tiles_x * f.tiles_y), f.offsets, f.members,
-            self.screen, f.features, F(f.alpha_cut), self.transmittance, f.stop, f.end, f.spans,
-            d_planes, d_transmittance, slot_sums,
+            workers(), f.tiles_x, f.offsets, f.members, f.slots, self.screen, f.features,
+            F(f.alpha_cut), self.transmittance[None], f.stop, f.blocks, d_planes,
+            d_transmittance[None], slot_sums,
         )  # fmt: skip
         count = len(self.screen)
         by_screen = np.empty((count, width), np.float32)
-        gather(f.first_slot, f.slots, slot_sums, self.screen, by_screen)
+        gather(f.first_slot, slot_sums, self.screen, by_screen)
         centres = by_screen[:, 0:2].copy()
         if f.with_flow:
             # flow = next centre - this centre
@@ -323,13 +321,12 @@ def _rasterize(
     count = len(packed)
     width, height = viewpoint.width, viewpoint.height
     near32, cut = F(near), F(alpha_cut)
-    screen = np.empty((count, SCREEN_COLUMNS), np.float32)
+    screen = aligned_empty(count, SCREEN_COLUMNS)
     project_forward(
         packed, viewpoint.pose, viewpoint.intrinsics, width, height, near32, F(low_pass), cut,
         antialiased, screen,
     )  # fmt: skip
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    stride = tile_stride(tiles_x * tiles_y)
     bounds, touched = np.empty((count, 4), np.int32), np.empty(count, np.int32)
     count_tiles(screen, tiles_x, tiles_y, cut, bounds, touched)
     order = order_by_depth(np.ascontiguousarray(screen[:, 8]).view(np.uint32), touched)
@@ -350,18 +347,17 @@ def _rasterize(
         with_depth, with_flow, near32, features,
     )  # fmt: skip
     planes = np.empty((features.shape[1], height, width), np.float32)
-    transmittance = np.empty((height, width), np.float32)
-    stop = np.empty((height, width), np.int32)
-    end = np.empty(tiles_x * tiles_y, np.int32)
-    spans = np.empty(len(members), np.int32)
+    transmittance = np.empty((1, height, width), np.float32)
+    stop = np.empty((1, height, width), np.int32)
+    blocks = np.empty(len(members), np.int64)
     shown = np.empty((0, 0), np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_)
     composite_forward(
-        tiles_x, tiles_y, stride, offsets, members, screen, features, cut, shown, planes,
-        transmittance, stop, end, spans,
+        workers(), tiles_x, offsets, members, screen, features, cut, shown, planes, transmittance,
+        stop, blocks,
     )  # fmt: skip
     forward = _Pass(
         packed, viewpoint, following, degree, near, low_pass, alpha_cut, antialiased, with_depth,
-        with_flow, tiles_x, tiles_y, offsets, members, first_slot, slots, stop, end, spans,
+        with_flow, tiles_x, tiles_y, offsets, members, first_slot, slots, stop, blocks,
         features,
     )  # fmt: skip
-    return Rendering(planes[:channels], transmittance, screen, forward)
+    return Rendering(planes[:channels], transmittance[0], screen, forward)

@@ -21,3 +21,8 @@ def use_threads(threads: int | None) -> None:
     """Let the kernels of this process use `threads` threads (None: all there are)."""
     available = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(max(1, min(threads or available, available)))
+
+
+def workers() -> int:
+    """How many threads a kernel may use now."""
+    return int(numba.get_num_threads())

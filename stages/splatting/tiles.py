@@ -8,12 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from stages.splatting import blocks
+
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 F = np.float32
 
-#: Tiles are TILE x TILE pixels; a row of a tile is one AVX-512 vector of float32.
-TILE = 16
+#: Tiles are TILE x TILE pixels.
+TILE = blocks.TILE
 CHUNK = 256
 _DIGIT_BITS = 11
 
@@ -177,7 +179,8 @@ def fill_tiles(order, first_slot, tile_of_slot, tiles):  # type: ignore[no-untyp
     Returns:
         offsets: [tiles + 1] int32, where each tile's part of `members` begins.
         members: [M] int32, Gaussians by tile.
-        slots: [M] int32, positions in `members` by Gaussian, tiles in raster order.
+        slots: [M] int32, for each of `members` its slot, which are those of a Gaussian one after
+            another, its tiles in raster order.
     """
     offsets = np.zeros(tiles + 1, np.int32)
     for slot in range(tile_of_slot.shape[0]):
@@ -191,7 +194,8 @@ def fill_tiles(order, first_slot, tile_of_slot, tiles):  # type: ignore[no-untyp
         i = order[k]
         for slot in range(first_slot[i], first_slot[i + 1]):
             tile = tile_of_slot[slot]
-            slots[slot] = position[tile]
-            members[position[tile]] = i
-            position[tile] += 1
+            at = position[tile]
+            members[at] = i
+            slots[at] = slot
+            position[tile] = at + 1
     return offsets, members, slots

@@ -51,15 +51,17 @@ def lit_image(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return np.clip(planes.transpose(1, 2, 0), 0, 1)
 
 
-def case(lit: bool) -> tuple[Views, Cameras, Points, Gaussians]:
+def case(lit: bool, shine: float = 1.0) -> tuple[Views, Cameras, Points, Gaussians]:
     """Five views of the sheet, under a moving flash or painted in fixed colours."""
+    narrow, broad = TRUTH["strengths"]
+    truth = TRUTH | {"strengths": (shine * narrow, shine * broad)}
     dense = bump(9000, 1)
     count = len(dense)
     gaussians = Gaussians(
         dense.positions, np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
         np.full((count, 3), np.log(0.7), np.float32), np.full(count, 3.0, np.float32),
         np.zeros((count, 16, 3), np.float32),
-        Light(dense.colors, dense.normals, distance=100.0, **TRUTH),
+        Light(dense.colors, dense.normals, distance=100.0, **truth),
     )  # fmt: skip
     gaussians.sh[:, 0] = (dense.colors - 0.5) / 0.28209479177387814
     cameras = [looking(angle, f"{i:03d}") for i, angle in enumerate(np.linspace(-0.5, 0.5, 5))]
@@ -115,6 +117,33 @@ def test_fixed_colours_are_not_taken_for_a_light(tmp_path) -> None:
     FitStage().run(here)
     assert here.figures["light"] == "none"
     assert here.result("gaussians").light is None
+
+
+def test_on_a_held_surface_the_shading_tells_which_light_it_was(tmp_path) -> None:
+    for lit in (True, False):
+        # as over most of a jaw, highlights are no more than spots
+        views, cameras, points, _ = case(lit=lit, shine=0.1)
+        few = Views(views=(views.views[0], views.views[2], views.views[4]))
+        here = context(tmp_path / str(lit), few, cameras, points, light="auto", iterations=20,
+                       hold_surface=True)  # fmt: skip
+        FitStage().run(here)
+        assert here.figures["light"] == ("camera" if lit else "none")
+        share = here.figures["light_error_camera"] / here.figures["light_error_none"]
+        assert share < 0.7 if lit else share > 0.9
+
+
+def test_nothing_is_concluded_where_no_surface_is_shared(tmp_path) -> None:
+    views, cameras, points, _ = case(lit=True)
+    apart = []
+    for view, side in ((views.views[0], slice(0, 40)), (views.views[4], slice(56, WIDTH))):
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[:, side] = True
+        apart.append(View(view.name, view.image, mask))
+    here = context(tmp_path, Views(tuple(apart)), cameras, points, light="auto", iterations=20,
+                   hold_surface=True)  # fmt: skip
+    FitStage().run(here)
+    assert here.figures["light"] == "none"
+    assert "light_error_none" not in here.figures
 
 
 class StoppedError(Exception):
