@@ -40,12 +40,10 @@ class FitConfig(StageConfig):
         ge=0,
         le=1,
     )
-    fill_share: float = number(
-        0.0,
-        "largest share of the Gaussians that starts from points filled in; 0: none, what was not "
-        "measured grows from what was",
-        ge=0,
-        le=1,
+    fill_share: Auto | float = number(
+        AUTO,
+        "largest share of the Gaussians that starts from points filled in (auto: 0.03; none from 6 "
+        "views: between so many, what was not measured grows better from what was)",
     )
     normal_neighbours: int = number(
         12, "average normals over so many points; 0: as they are", ge=0, le=200
@@ -68,7 +66,7 @@ class FitConfig(StageConfig):
         6.0, "and its largest value, in pixels of the nearest view", gt=0
     )
     sh_degree: Auto | int = number(
-        AUTO, "degree of the spherical harmonics (auto: 1; 2 on a held surface)"
+        AUTO, "degree of the spherical harmonics (auto: 1; 2 from 6 views and on a held surface)"
     )
     sh_degree_interval: int = number(
         0, "iterations until the next degree is used; 0: all from the start (3DGS: 1000)", ge=0
@@ -162,7 +160,7 @@ class FitConfig(StageConfig):
     feature_rest_lr: Auto | float = number(
         AUTO,
         "learning rate of the other harmonics (3DGS: 0.000125; auto: a twentieth of feature_lr; "
-        "0.002 on a held surface)",
+        "0.002 from 6 views and on a held surface)",
     )
     opacity_lr: float = number(0.05, "learning rate of opacities", ge=0)
     scaling_lr: Auto | float = number(AUTO, "learning rate of log scales (3DGS: 0.005)")
@@ -286,7 +284,7 @@ class FitConfig(StageConfig):
             "feature_rest_lr": 0, "light_albedo_lr": 0, "scaling_lr": 0, "rotation_lr": 0,
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
-            "light_strength_lr": 0,
+            "light_strength_lr": 0, "fill_share": 0,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0
@@ -299,7 +297,7 @@ class FitConfig(StageConfig):
             value = getattr(self, name)
             if value != "auto" and value < least:
                 raise ValueError(f"{name} must be 'auto' or at least {least}, not {value}")
-        for name, most in {"sh_degree": 3, "final_prune_masked": 1}.items():
+        for name, most in {"sh_degree": 3, "final_prune_masked": 1, "fill_share": 1}.items():
             value = getattr(self, name)
             if value != "auto" and value > most:
                 raise ValueError(f"{name} must be 'auto' or at most {most}, not {value}")

@@ -127,10 +127,11 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "iterations": iterations,
         "initial_points": 30000 if many else 15000,
         "trusted_confidence": 1.5,
-        "sh_degree": 1,
+        "fill_share": 0.0 if many else 0.03,
+        "sh_degree": 2 if many else 1,
         "final_prune_masked": 0.2,
         "feature_lr": 2.5e-3 * rate,
-        "feature_rest_lr": 2.5e-3 / 20 * rate,
+        "feature_rest_lr": 2e-3 if many else 2.5e-3 / 20 * rate,
         # in colour, not in harmonics: C0 times as much
         "light_albedo_lr": 7e-4 * rate,
         "light_strengths": (0.5, 0.04),
