@@ -66,7 +66,7 @@ class FitConfig(StageConfig):
         6.0, "and its largest value, in pixels of the nearest view", gt=0
     )
     sh_degree: Auto | int = number(
-        AUTO, "degree of the spherical harmonics (auto: 1; 2 from 6 views and on a held surface)"
+        AUTO, "degree of the spherical harmonics (auto: 1; 2 from 9 views and on a held surface)"
     )
     sh_degree_interval: int = number(
         0, "iterations until the next degree is used; 0: all from the start (3DGS: 1000)", ge=0
@@ -160,7 +160,7 @@ class FitConfig(StageConfig):
     feature_rest_lr: Auto | float = number(
         AUTO,
         "learning rate of the other harmonics (3DGS: 0.000125; auto: a twentieth of feature_lr; "
-        "0.002 from 6 views and on a held surface)",
+        "0.002 from 9 views and on a held surface)",
     )
     opacity_lr: float = number(0.05, "learning rate of opacities", ge=0)
     scaling_lr: Auto | float = number(AUTO, "learning rate of log scales (3DGS: 0.005)")

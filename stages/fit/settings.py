@@ -7,6 +7,8 @@ from typing import Any
 
 #: From this number of views on, a fit is limited by its capacity; below, by what the views say.
 MANY_VIEWS = 6
+#: from so many on, they see most points from enough sides for two degrees of harmonics
+PLENTY_OF_VIEWS = 9
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         views: how many are placed.
         held: Gaussians are held to their surface.
     """
-    many = views >= MANY_VIEWS
+    many, plenty = views >= MANY_VIEWS, views >= PLENTY_OF_VIEWS
     rate = 6.0 if many else 2.0
     iterations = 1000 if many else 400 + 200 * max(0, views - 3)
     chosen = {
@@ -128,10 +130,10 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "initial_points": 30000 if many else 15000,
         "trusted_confidence": 1.5,
         "fill_share": 0.0 if many else 0.03,
-        "sh_degree": 2 if many else 1,
+        "sh_degree": 2 if plenty else 1,
         "final_prune_masked": 0.2,
         "feature_lr": 2.5e-3 * rate,
-        "feature_rest_lr": 2e-3 if many else 2.5e-3 / 20 * rate,
+        "feature_rest_lr": 2e-3 if plenty else 2.5e-3 / 20 * rate,
         # in colour, not in harmonics: C0 times as much
         "light_albedo_lr": 7e-4 * rate,
         "light_strengths": (0.5, 0.04),

@@ -194,6 +194,18 @@ def test_what_a_held_surface_changes_unless_the_user_says_otherwise() -> None:
     assert chosen.hold_surface and chosen.sh_degree == 0
 
 
+def test_settings_follow_the_number_of_views() -> None:
+    few, many, plenty = (resolve(FitConfig().model_dump(), views, 0) for views in (3, 6, 9))
+    assert few.fill_share > 0 and many.fill_share == plenty.fill_share == 0
+    assert (few.densify, many.densify, plenty.densify) == (False, True, True)
+    assert (few.sh_degree, many.sh_degree, plenty.sh_degree) == (1, 1, 2)
+    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    assert held.light_strength_lr == 0 < few.light_strength_lr
+    assert held.light_strengths[0] < few.light_strengths[0]
+    said = resolve(FitConfig(fill_share=0.5, light_strengths=(1.0, 0.1)).model_dump(), 9, 0)
+    assert (said.fill_share, said.light_strengths) == (0.5, (1.0, 0.1))
+
+
 def test_the_background_is_found_where_nothing_is_masked_out() -> None:
     camera = Camera("a", 16, 12, 20.0, 20.0, 8.0, 6.0, np.eye(4))
     image = np.full((12, 16, 3), 0.5, np.float32)
