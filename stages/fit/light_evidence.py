@@ -49,7 +49,6 @@ class Sight:
         seen: [N] bool.
         radiance: [N] linear light.
         cosine: [N] between normal and line of sight.
-        distance: [N] from the camera.
     """
 
     seen: Bools
