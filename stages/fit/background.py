@@ -99,7 +99,6 @@ class Background:
             return
         gradient = sums.sum(0)
         self.steps += 1
-        gradient = sums.sum(0)
         self.moments[0] = 0.9 * self.moments[0] + 0.1 * gradient
         self.moments[1] = 0.99 * self.moments[1] + 0.01 * gradient**2
         mean = self.moments[0] / (1 - 0.9**self.steps)

@@ -13,8 +13,9 @@ and a projected Gaussian is one row of `screen` [N, 16] float32:
     a cache line
 
 Every kernel works in chunks of fixed length, so that its result does not depend on the number of
-threads (a vectorised loop may round differently from its scalar remainder). The functions that a
-kernel calls are in its own file, because numba's cache looks at the time stamp of that file alone.
+threads (a vectorised loop may round differently from its scalar remainder). Numba's cache looks at
+the time stamp of a kernel's own file alone: the functions that it calls are in there too, but for
+those of `lanes`, after a change of which the files of the kernels have to be touched.
 """
 
 from __future__ import annotations
