@@ -95,12 +95,14 @@ class FitConfig(StageConfig):
     )
     light_strengths: Auto | tuple[float, float] = number(
         AUTO,
-        "strengths of the two lobes in linear light, to start with (auto: 0.5 and 0.04; 0.15 and "
+        "strengths of the two lobes in linear light, to start with (auto: 0.5 and 0.04; 0.3 and "
         "0.04 on a held surface)",
     )
     light_gamma: float = number(2.2, "exponent of the photographs' encoding", ge=1, le=4)
     light_albedo_lr: Auto | float = number(AUTO, "learning rate of albedos")
-    light_normal_lr: float = number(5e-3, "learning rate of the normals that are lit", ge=0)
+    light_normal_lr: Auto | float = number(
+        AUTO, "learning rate of the normals that are lit (auto: 0.005; 0.002 on a held surface)"
+    )
     light_lr: float = number(1e-2, "learning rate of logit k and of the lobes' log widths", ge=0)
     light_falloff_lr: float = number(5e-3, "learning rate of the falloff's exponent", ge=0)
     light_strength_lr: Auto | float = number(
@@ -140,7 +142,8 @@ class FitConfig(StageConfig):
     )
     lambda_depth: Auto | float = number(
         AUTO,
-        "weight of the depth prior from the input points, in units of the scene's depth; 0: none",
+        "weight of the depth prior from the input points, in units of the scene's depth; 0: none "
+        "(auto: 0.5, 0.3 from 6 views, none on a held surface)",
     )
     coarse_fraction: float = number(0.6, "share of the iterations at reduced size", ge=0, le=1)
     coarse_factor: int = number(2, "by which factor images are reduced then", ge=1, le=8)
@@ -216,6 +219,27 @@ class FitConfig(StageConfig):
     hold_colors_until: float = number(
         0.0, "up to this share of the iterations, held Gaussians change colour only", ge=0, le=1
     )
+    warp_levels: int = number(
+        4,
+        "bend the surface of the points as a whole by splines of so many widths, each twice the "
+        "one before; 0: Gaussians only move on their own",
+        ge=0,
+        le=8,
+    )
+    warp_spacing: float = number(
+        0.01, "spacing of the finest of these splines, as a share of the scene's depth", gt=0
+    )
+    warp_spacing_px: float = number(
+        5.0, "and no less than so many pixels: what is finer no photograph can tell", gt=0
+    )
+    warp_lr_init: Auto | float = number(
+        AUTO,
+        "learning rate of the splines at the start, as a share of the scene's depth (auto: 1e-4; "
+        "3e-4 on a held surface, where nothing else moves it)",
+    )
+    warp_lr_final: Auto | float = number(
+        AUTO, "learning rate of the splines at the end (auto: 1e-5; 1e-4 on a held surface)"
+    )
     densify: Auto | bool = number(AUTO, "clone and split Gaussians (auto: from 6 views)")
     strategy: Literal["default", "mcmc"] = number(
         "default", "densify by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"
@@ -284,7 +308,8 @@ class FitConfig(StageConfig):
             "feature_rest_lr": 0, "light_albedo_lr": 0, "scaling_lr": 0, "rotation_lr": 0,
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
-            "light_strength_lr": 0, "fill_share": 0,
+            "light_strength_lr": 0, "light_normal_lr": 0, "fill_share": 0,
+            "warp_lr_init": 0, "warp_lr_final": 0,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0

@@ -38,6 +38,7 @@ class LensLight:
     Attributes:
         material: [N, 6] float32, albedo and normal.
         values: [6] float64: k, p, m and s of the narrow lobe, m and s of the broad one.
+        by_normal: [N, 3] float32 gradient of the last step by the normals.
     """
 
     def __init__(self, material: Floats, settings: FitSettings) -> None:
@@ -51,6 +52,7 @@ class LensLight:
         self.adam = Adam(material.shape, 0.9, 0.999, 1e-15)
         self.first, self.second = np.zeros(6), np.zeros(6)
         self.radiance = np.empty((0, 3), np.float32)
+        self.by_normal: Floats = np.empty((0, 3), np.float32)
 
     def coefficients(self) -> Floats:
         """[8] for `shade`. In the frame of a fit the scene's depth is 1: the falloff's distance."""
@@ -82,6 +84,7 @@ class LensLight:
         fall = s.light_lr_decay**done
         rates = np.empty(6, np.float32)
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall
+        self.by_normal = result.material[:, 3:]
         self.adam.step(self.material, result.material, rates)
         # a black albedo has no slope to come back by
         np.maximum(self.material[:, :3], np.float32(2e-3), out=self.material[:, :3])

@@ -59,7 +59,7 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
         settings, iterations=settings.light_trial_iterations,
         initial_points=settings.light_trial_points,
         coarse_fraction=1.0, coarse_factor=factor,
-        lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False,
+        lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False, warp_levels=0,
         opacity_reset_interval=0, sh_degree_interval=0,
     )  # fmt: skip
     target = scene.targets[held][factor]

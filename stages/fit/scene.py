@@ -19,6 +19,7 @@ from stages.fit.settings import FitSettings
 from stages.fit.surface import HeldSurface, along_normals
 from stages.fit.targets import Target, make_pyramids, point_depth
 from stages.fit.trainer import Trainer
+from stages.fit.warp import Warp
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -81,16 +82,20 @@ class Scene:
         if settings.hold_surface:
             along_normals(packed, thinned.normals, settings.hold_flatness)
             held_surface = HeldSurface(
-                packed,
-                thinned.normals,
-                thinned.weight,
-                settings.hold_strength,
+                packed, thinned.normals, thinned.weight, settings.hold_strength,
                 settings.hold_growth,
+            )  # fmt: skip
+        warp = None
+        if settings.warp_levels:
+            pixel = 1 / max(camera.fx for camera in self.cameras)
+            spacing = max(settings.warp_spacing, settings.warp_spacing_px * pixel)
+            warp = Warp(
+                thinned.positions, thinned.normals, spacing, settings.warp_levels, len(self.views)
             )
         extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
         return Trainer(
-            packed, poses, middle, self.targets, extent, settings, light, held_surface
+            packed, poses, middle, self.targets, extent, settings, light, held_surface, warp
         )  # fmt: skip
 
     def _one_after_another(self, settings: FitSettings) -> Trainer:

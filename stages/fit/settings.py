@@ -83,6 +83,11 @@ class FitSettings:
     hold_flatness: float
     hold_growth: float
     hold_colors_until: float
+    warp_levels: int
+    warp_spacing: float
+    warp_spacing_px: float
+    warp_lr_init: float
+    warp_lr_final: float
     densify: bool
     strategy: str
     noise_lr: float
@@ -136,6 +141,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "feature_rest_lr": 2e-3 if plenty else 2.5e-3 / 20 * rate,
         # in colour, not in harmonics: C0 times as much
         "light_albedo_lr": 7e-4 * rate,
+        "light_normal_lr": 5e-3,
         "light_strengths": (0.5, 0.04),
         "light_strength_lr": 2e-2,
         "scaling_lr": 5e-3 * rate,
@@ -143,6 +149,8 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
         "lambda_depth": 0.3 if many else 0.5,
+        "warp_lr_init": 1e-4,
+        "warp_lr_final": 1e-5,
         "pose_lr_init": 3e-4,
         "pose_lr_final": 3e-6,
     }
@@ -155,8 +163,12 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
             "final_prune_masked": 0.0,
             "feature_lr": 1.5e-2,
             "feature_rest_lr": 2e-3,
-            "light_strengths": (0.15, 0.04),
+            "light_normal_lr": 2e-3,
+            "light_strengths": (0.3, 0.04),
             "light_strength_lr": 0.0,
+            "lambda_depth": 0.0,
+            "warp_lr_init": 3e-4,
+            "warp_lr_final": 1e-4,
         }
     return chosen
 

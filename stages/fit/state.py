@@ -32,6 +32,7 @@ def save_state(trainer: Trainer, path: Path) -> None:
         "curve": np.array(trainer.curve, np.float64).reshape(-1, 4),
         **(trainer.light.arrays() if trainer.light is not None else {}),
         **(trainer.held_surface.arrays() if trainer.held_surface is not None else {}),
+        **(trainer.warp.arrays() if trainer.warp is not None else {}),
     }
     facts = {
         "fingerprint": trainer.fingerprint,
@@ -68,6 +69,8 @@ def restore_state(trainer: Trainer, path: Path) -> bool:
         trainer.light.restore(arrays, facts["adam_steps"])
     if trainer.held_surface is not None:
         trainer.held_surface.restore(arrays)
+    if trainer.warp is not None:
+        trainer.warp.restore(arrays)
     trainer.focal.restore(facts["focal"])
     trainer.background.restore(facts["background"])
     if trainer.progressive is not None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.checkpoint import Arrays
+from stages.fit.warp import turned
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -92,6 +93,17 @@ class HeldSurface:
         self.anchor: Floats = np.concatenate(columns, 1).astype(np.float32)
         self.turn: Floats = packed[:, 3:7].copy()
 
+    def follow(self, move: Floats, normals: Floats) -> None:
+        """Go with a surface that has bent.
+
+        Args:
+            move: [N, 3] by how much its points have moved.
+            normals: [N, 3] unit, or 0: what they face now.
+        """
+        self.turn = turned(self.turn, self.anchor[:, 3:6], normals)
+        self.anchor[:, :3] += move
+        self.anchor[:, 3:6] = normals
+
     def pull(self, packed: Floats) -> None:
         """Draw Gaussians back onto their surface: position, turn, thickness; bound the width."""
         normal, firmness = self.anchor[:, 3:6], self.anchor[:, 7]
@@ -107,7 +119,9 @@ class HeldSurface:
         self.turn = np.ascontiguousarray(self.turn[source])
 
     def arrays(self) -> Arrays:
+        """The whole state, for a checkpoint."""
         return {"held_anchor": self.anchor, "held_turn": self.turn}
 
     def restore(self, arrays: Arrays) -> None:
+        """Take up what `arrays` gave."""
         self.anchor, self.turn = arrays["held_anchor"], arrays["held_turn"]

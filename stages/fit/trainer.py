@@ -25,6 +25,7 @@ from stages.fit.settings import FitSettings
 from stages.fit.state import restore_state, save_state
 from stages.fit.surface import HeldSurface
 from stages.fit.targets import Target
+from stages.fit.warp import Warp, turned
 from stages.splatting.adam import Adam
 from stages.splatting.projection import HARMONICS
 from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint, rasterize
@@ -58,6 +59,7 @@ class Trainer:
         settings: FitSettings,
         light: LensLight | None = None,
         held_surface: HeldSurface | None = None,
+        warp: Warp | None = None,
         progressive: Progressive | None = None,
     ) -> None:
         """
@@ -70,11 +72,13 @@ class Trainer:
             settings: all constants.
             light: gives the colours, in place of the harmonics.
             held_surface: draws Gaussians back to where they started.
+            warp: bends the surface that they started on.
             progressive: brings in the views one after another.
         """
         self.settings = settings
         self.light = light
         self.held_surface = held_surface
+        self.warp = warp
         self.progressive = progressive
         self.targets = targets
         self.extent = extent
@@ -265,11 +269,31 @@ class Trainer:
         if s.isotropic:
             gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
         rates = self.rates()
+        self._bend(gradient)
         self.adam.step(self.packed, gradient, rates)
         if s.densify and s.strategy == "mcmc":
             add_noise(self.packed, s.noise_lr * float(rates[0]), self.random)
         if self.held_surface is not None:
             self.held_surface.pull(self.packed)
+
+    def _bend(self, gradient: Floats) -> None:
+        """Let the surface as a whole follow the gradients of the Gaussians on it."""
+        s, light, warp = self.settings, self.light, self.warp
+        done = self.iteration / s.iterations
+        frozen = self.held_surface is not None and done < s.hold_colors_until
+        if warp is None or frozen:
+            return
+        warp.collect(gradient[:, :3], None if light is None else light.by_normal)
+        before = warp.facing
+        bent = warp.move(interpolate(s.warp_lr_init, s.warp_lr_final, done))
+        if bent is None:
+            return
+        self.packed[:, :3] += bent.move
+        self.packed[:, 3:7] = turned(self.packed[:, 3:7], before, warp.facing)
+        if light is not None:
+            light.material[:, 3:] += bent.lean
+        if self.held_surface is not None:
+            self.held_surface.follow(bent.move, warp.facing)
 
     def diverged(self, what: str) -> ReconstructionError:
         return ReconstructionError(
@@ -330,6 +354,8 @@ class Trainer:
             self.light.select(source, fresh)
         if self.held_surface is not None:
             self.held_surface.select(source)
+        if self.warp is not None:
+            self.warp.select(source)
         self.statistics = DensityStatistics.empty(len(packed))
 
     def run(

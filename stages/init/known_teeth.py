@@ -22,6 +22,7 @@ from stages.init.dense.reconstruct import complete_depths
 from stages.init.dental.centred import CentredView, centre_view
 from stages.init.dental.photo import PhotoOptions
 from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
+from stages.init.dental.surface_options import SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement
 from stages.init.teeth import arch_options, masked, neighbours, surface_options, tooth_counts
@@ -32,6 +33,12 @@ Array = npt.NDArray[np.float64]
 #: With cameras that are exact the gum can be followed this far beyond the crowns (mm), and what
 #: photographs agree on there is believed as it is on the crowns.
 GUM_HEIGHT, GUM_TRUST = 20.0, 1.0
+#: Nor does a match have to be near where the crown shapes expect it: back teeth that one landmark
+#: each has placed may be centimetres off. What bends in millimetres is left to the fit.
+ROUNDS = (
+    SweepRound(reach=8.0, step=0.15, window=1.2, prior=0.1, stiffness=10.0),
+    SweepRound(reach=1.5, step=0.075, window=0.8, prior=0.15, stiffness=12.0),
+)
 #: Where no photographs agree, the charts are still mm and not cm off, unlike what is filled in
 #: around them: their confidence is 1 + exp of this.
 GUESS = -0.5
@@ -81,7 +88,9 @@ def from_known_teeth(
     for hint in arch.labels:
         x, y = centred[hint.photo].point(hint.x, hint.y)
         hints.append(replace(hint, x=x, y=y))
-    surface = replace(surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS)
+    surface = replace(
+        surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS
+    )
     if config.dental.gum_height is None:
         surface = replace(surface, gum_height=GUM_HEIGHT)
     teeth = reconstruct_teeth(

@@ -28,7 +28,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 3
+    version = 4
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -64,9 +64,9 @@ class SurfaceOptions:
     # last; cameras must be exact for that
     grow_from: float = 5.0
     # height of the strips
-    grow_step: float = 2.5
+    grow_step: float = 1.5
     # the sweep of each strip
-    grow_round: SweepRound = SweepRound(reach=2.4, step=0.15, window=1.6, prior=0.1, stiffness=2.0)
+    grow_round: SweepRound = SweepRound(reach=4.0, step=0.15, window=1.6, prior=0.1, stiffness=8.0)
     # weight of what photographs agree on there, against 1 on the crowns
     gum_trust: float = 0.2
     # a pixel is gum if its colour is within so many standard deviations of that beside the crowns
