@@ -232,6 +232,11 @@ class FitConfig(StageConfig):
     warp_spacing_px: float = number(
         5.0, "and no less than so many pixels: what is finer no photograph can tell", gt=0
     )
+    warp_slope: Auto | float = number(
+        AUTO,
+        "no width of splines gets steeper than about this (auto: 2 with a light beside the lens; "
+        "0.3 without, where highlights that move would tear the surface)",
+    )
     warp_lr_init: Auto | float = number(
         AUTO,
         "learning rate of the splines at the start, as a share of the scene's depth (auto: 1e-4; "
@@ -309,7 +314,7 @@ class FitConfig(StageConfig):
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
             "light_strength_lr": 0, "light_normal_lr": 0, "fill_share": 0,
-            "warp_lr_init": 0, "warp_lr_final": 0,
+            "warp_lr_init": 0, "warp_lr_final": 0, "warp_slope": 1e-3,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0

@@ -15,8 +15,8 @@ PLENTY_OF_VIEWS = 9
 class FitSettings:
     """See `config.FitConfig` for what each field means.
 
-    What depends on the views is not ``"auto"`` any more; `light` (a trial decides) and `background`
-    (the masks do) may be.
+    What depends on the views is not ``"auto"`` any more; `light` (a trial decides), `warp_slope`
+    (the light does) and `background` (the masks do) may be.
     """
 
     iterations: int
@@ -85,6 +85,7 @@ class FitSettings:
     hold_colors_until: float
     warp_levels: int
     warp_spacing: float
+    warp_slope: float | str
     warp_spacing_px: float
     warp_lr_init: float
     warp_lr_final: float

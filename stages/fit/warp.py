@@ -47,13 +47,20 @@ class Warp:
     """
 
     def __init__(
-        self, positions: Array, normals: Array, spacing: float, levels: int, views: int
+        self,
+        positions: Array,
+        normals: Array,
+        spacing: float,
+        levels: int,
+        slope: float,
+        views: int,
     ) -> None:
         """
         Args:
             positions, normals: [N, 3] the surface; where the normal is 0, it stays.
             spacing: of the finest splines, in units of the frame.
             levels: of splines, each twice as wide as the one before.
+            slope: no level of splines gets steeper than about this.
             views: so many gradients make a move, one of each photograph.
         """
         self.field = SplineField(positions, spacing, levels)
@@ -61,6 +68,9 @@ class Warp:
         self.facing = self.normals
         self.adam = Adam((len(self.field.coefficients), 1), 0.9, 0.999, 1e-15)
         self.views = views
+        widths = spacing * 2.0 ** np.arange(levels)
+        #: [K] largest coefficients
+        self.limits: Floats = np.repeat(slope * widths, self.field.sizes).astype(np.float32)
         self.collected = 0
         self.gradient: Floats = np.zeros((len(positions), 4), np.float32)
         #: [N, 4] displacement and lean so far
@@ -86,6 +96,8 @@ class Warp:
             return None
         gradient = self.field.gather(self.gradient)
         rates = np.array([rate * self.collected], np.float32)
+        # Adam's steps are no longer than the rate: shrunk like this, none gets past its limit
+        self.field.coefficients *= 1 - np.minimum(rates / self.limits, F(1))
         self.adam.step(self.field.coefficients[:, None], gradient[:, None], rates)
         self.gradient[:] = 0
         self.collected = 0

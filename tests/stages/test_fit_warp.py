@@ -110,7 +110,7 @@ def test_a_warp_moves_along_normals_once_all_views_have_spoken() -> None:
     where = points()
     normals = np.tile([0.0, 0, 1], (500, 1))
     normals[:100] = 0  # unknown
-    warp = Warp(where, normals, SPACING, 2, views=3)
+    warp = Warp(where, normals, SPACING, 2, 1.0, views=3)
     push = np.tile(np.float32([5, 5, -1]), (500, 1))  # a loss that falls towards +z
     for speaker in range(3):
         warp.collect(push, None)
@@ -121,7 +121,7 @@ def test_a_warp_moves_along_normals_once_all_views_have_spoken() -> None:
     assert not bent.move[:100].any() and not warp.facing[:100].any()
     assert np.abs(bent.lean[:, 2]).max() < 1e-6  # a change of direction, across the normal
     # and a pull at the normals tilts the surface under them
-    warp = Warp(where, normals, SPACING, 2, views=1)
+    warp = Warp(where, normals, SPACING, 2, 1.0, views=1)
     for _ in range(20):
         warp.collect(np.zeros_like(push), np.tile(np.float32([-1, 0, 0]), (500, 1)))
         warp.move(0.01)
