@@ -38,6 +38,8 @@ class FitResult:
     flow_pairs: pairs that the flow loss used.
     light: ``"camera"`` or ``"none"``, what was used.
     surface_held: Gaussians were held to the surface of the points.
+    surface_bent: by how much 95 % of the surface has moved at most, as a share of the scene's
+        depth; 0 where it was left as it is.
     light_figures: PSNR of the held-out photograph in the trials, where there were any.
     """
 
@@ -50,6 +52,7 @@ class FitResult:
     light: str
     light_figures: dict[str, float]
     surface_held: bool
+    surface_bent: float
 
 
 def fit(
@@ -123,6 +126,7 @@ def fit(
         to_world(gaussians, scene.frame), tuple(refined), psnr, ssim,
         before - len(trainer.packed), len(scene.flows), light, figures,
         trainer.held_surface is not None,
+        trainer.warp.reach() if trainer.warp is not None else 0.0,
     )  # fmt: skip
 
 

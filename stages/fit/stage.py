@@ -91,6 +91,7 @@ class FitStage(Stage):
             iterations=settings.iterations,
             light=result.light,
             surface_held=str(result.surface_held),
+            surface_bent=round(result.surface_bent, 5),
             **result.light_figures,
             train_psnr=round(float(result.psnr.mean()), 3),
             train_ssim=round(float(result.ssim.mean()), 4),

@@ -116,6 +116,11 @@ class Warp:
         lean = (slope * self.normals).sum(1, keepdims=True) * self.normals - slope
         return np.concatenate([displacement[:, None], lean], 1) * known
 
+    def reach(self) -> float:
+        """By how much 95 % of the surface has moved at most, in units of the frame."""
+        known = np.abs(self.normals).sum(1) > 0
+        return float(np.quantile(np.abs(self.shape[known, 0]), 0.95)) if known.any() else 0.0
+
     def select(self, source: npt.NDArray[np.int64]) -> None:
         """Rows follow those of the packed scene."""
         self.field.select(source)

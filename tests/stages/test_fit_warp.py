@@ -129,6 +129,21 @@ def test_a_warp_moves_along_normals_once_all_views_have_spoken() -> None:
     assert np.linalg.norm(warp.facing[100:], axis=1) == pytest.approx(1, abs=1e-5)
 
 
+def test_a_warp_gets_no_steeper_than_it_may() -> None:
+    where = points()
+    normals = np.tile([0.0, 0, 1], (500, 1))
+    warp = Warp(where, normals, SPACING, 3, 0.2, views=1)
+    rng = np.random.default_rng(9)
+    torn = rng.choice([-1, 1], (500, 1)) * np.float32([0, 0, 1])  # neighbours pull both ways
+    for _ in range(300):
+        warp.collect(torn, None)
+        assert warp.move(0.01) is not None
+    largest = np.abs(warp.field.coefficients)
+    assert (largest <= 1.01 * warp.limits).all() and (largest > 0.9 * warp.limits).any()
+    # three splines along each axis share a slope, on each of three levels
+    assert np.abs(warp.shape[:, 1:]).max() < 3 * 2 * 0.2
+
+
 def dented(count: int, depth: float) -> Points:
     """The sheet of `case`, pushed away from the cameras where its middle is."""
     sheet = bump(count, 2)
@@ -156,6 +171,7 @@ def test_photographs_bend_a_wrong_surface_back(tmp_path) -> None:
             iterations=300, warp_levels=levels, warp_spacing=0.04, light_sh_iterations=1,
         )  # fmt: skip
         FitStage().run(here)
+        assert (here.figures["surface_bent"] > 0.005) == (levels > 0)
         means = here.result("gaussians").means
         near = (np.abs(means[:, :2]) < 15).all(axis=1)
         middle[levels] = float(np.median(tree.query(means[near])[0]))
