@@ -32,8 +32,6 @@ EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
 
 
-#: slope of a warp with a light and without
-STEEPEST_LIT, STEEPEST = 2.0, 0.3
 #: where fewer of the points than this share are trusted, confidence means something else
 MIN_TRUSTED = 0.02
 #: surfaces are looked up at this fraction of the image size: measured points are not everywhere
@@ -93,7 +91,7 @@ class Scene:
             spacing = max(settings.warp_spacing, settings.warp_spacing_px * pixel)
             warp = Warp(
                 thinned.positions, thinned.normals, spacing, settings.warp_levels,
-                steepest(settings, lit), len(self.views),
+                settings.steepest(lit), len(self.views),
             )  # fmt: skip
         extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
@@ -142,13 +140,6 @@ class Scene:
             flows={},
             targets=[self.targets[index] for index in rest],
         )
-
-
-def steepest(settings: FitSettings, lit: bool) -> float:
-    """The slope that a warp may have: more where highlights are not taken for shape."""
-    if isinstance(settings.warp_slope, str):
-        return STEEPEST_LIT if lit else STEEPEST
-    return settings.warp_slope
 
 
 def prepare(

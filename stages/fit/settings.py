@@ -9,6 +9,8 @@ from typing import Any
 MANY_VIEWS = 6
 #: from so many on, they see most points from enough sides for two degrees of harmonics
 PLENTY_OF_VIEWS = 9
+#: what ``warp_slope: auto`` comes to, with a light beside the lens and without
+WARP_SLOPE_LIT, WARP_SLOPE = 2.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,12 @@ class FitSettings:
     divergence_factor: float
     preview_every: int
     checkpoint_every: int
+
+    def steepest(self, lit: bool) -> float:
+        """The slope that a warp may have: more where highlights are not taken for shape."""
+        if isinstance(self.warp_slope, str):
+            return WARP_SLOPE_LIT if lit else WARP_SLOPE
+        return self.warp_slope
 
 
 def automatic(views: int, held: bool = False) -> dict[str, Any]:

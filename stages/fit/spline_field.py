@@ -20,8 +20,6 @@ Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
 F = np.float32
 
-#: splines that reach a point: three along each axis
-REACH = 27
 #: sums over points are taken in so many parts, whatever the number of threads
 PARTS = 16
 #: what a spline passes on to the finer ones at -1.5, -0.5, 0.5 and 1.5 of their spacings

@@ -1,8 +1,8 @@
 """Gaussians held to the surface that they start on, in proportion to how sure it is.
 
 From three photographs a fit can explain every pixel with needles and gaps that only the three
-cameras don't see. Where the surface is known, only colour is left to be found: Gaussians start as
-flat discs along it, and what takes them off it is drawn back after every step.
+cameras don't see. Where the surface is known, Gaussians start as flat discs along it, and what
+takes them off it is drawn back after every step. The surface itself may bend as a whole (`warp`).
 """
 
 from __future__ import annotations
@@ -55,12 +55,9 @@ def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
         flatness: standard deviation along the normal, relative to that across it.
     """
     known = np.abs(normals).sum(1) > 0
-    n = normals[known]
-    # the shortest turn from z to n; for n = -z any half turn will do
-    quaternion = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], 1)
-    quaternion[1 + n[:, 2] < 1e-6] = (0, 1, 0, 0)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    packed[known, 3:7] = quaternion
+    unturned = np.tile(np.array([1, 0, 0, 0], np.float32), (int(known.sum()), 1))
+    ahead = np.tile(np.array([0.0, 0.0, 1.0]), (len(unturned), 1))
+    packed[known, 3:7] = turned(unturned, ahead, normals[known])
     packed[known, 9] += np.float32(np.log(flatness))
 
 

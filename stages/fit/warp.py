@@ -2,9 +2,9 @@
 
 Gaussians that each move on their own can't correct a surface: one image always pulls against the
 other, and there are a thousand ways to give in. What all of them within a millimetre or two want
-together is well determined. The surface moves along its normals by a smooth field (B-splines, the
-coarse ones first to move as their gradients add up), and its normals turn along, so that shading
-and highlights shape it as well as texture. Preconditioning of this kind is what inverse rendering
+together is well determined. The surface moves along its normals by a smooth field (B-splines of
+several widths), and its normals turn along, so that shading and highlights shape it as well as
+texture. Preconditioning of this kind is what inverse rendering
 of meshes lives by (Nicolet et al. 2021, "Large Steps in Inverse Rendering of Geometry").
 """
 
@@ -155,14 +155,15 @@ class Warp:
 def turned(quaternions: Floats, first: Floats, second: Floats) -> Floats:
     """Quaternions [N, 4] after the shortest turn that takes unit vectors `first` to `second`.
 
-    Vectors of opposite direction turn nothing.
+    Between opposite vectors it is one of the half turns; vectors of 0 turn nothing.
     """
-    w = 1 + (first * second).sum(1)
-    x, y, z = np.cross(first, second).T
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    some = length > F(1e-6)
-    scale = np.where(some, 1 / np.maximum(length, F(1e-6)), 0)
-    w, x, y, z = np.where(some, w * scale, F(1)), x * scale, y * scale, z * scale
+    turn = np.concatenate([1 + (first * second).sum(1, keepdims=True), np.cross(first, second)], 1)
+    opposite = turn[:, 0] < 1e-6
+    # an axis across them: the cross product with the axis that they are furthest from
+    furthest = np.eye(3)[np.abs(first[opposite]).argmin(1)]
+    turn[opposite, 0], turn[opposite, 1:] = 0, np.cross(first[opposite], furthest)
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    w, x, y, z = turn.T
     a, b, c, d = quaternions.T
     return np.stack(
         [

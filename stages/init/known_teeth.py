@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 #: photographs agree on there is believed as it is on the crowns.
 GUM_HEIGHT, GUM_TRUST = 20.0, 1.0
 #: Nor does a match have to be near where the crown shapes expect it: back teeth that one landmark
-#: each has placed may be centimetres off. What bends in millimetres is left to the fit.
+#: each has placed may be several mm off. Detail (hence the stiffness) is left to the fit.
 ROUNDS = (
     SweepRound(reach=8.0, step=0.15, window=1.2, prior=0.1, stiffness=10.0),
     SweepRound(reach=1.5, step=0.075, window=0.8, prior=0.15, stiffness=12.0),

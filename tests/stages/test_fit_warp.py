@@ -101,8 +101,9 @@ def test_a_turn_takes_one_direction_to_another() -> None:
     q = turned(none, first.astype(np.float32), second.astype(np.float32)).astype(np.float64)
     w, u = q[:, :1], q[:, 1:]
     result = first + 2 * np.cross(u, np.cross(u, first) + w * first)
-    assert result[1:] == pytest.approx(second[1:], abs=1e-5)
-    assert np.array_equal(q[0], none[0])  # there is no shortest turn
+    assert result == pytest.approx(second, abs=1e-5)  # among them a half turn
+    zero = np.zeros((50, 3), np.float32)
+    assert np.array_equal(turned(none, zero, zero), none)
     assert np.array_equal(turned(none, none[:, :3], none[:, :3]), none)
 
 
