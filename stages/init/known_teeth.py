@@ -34,11 +34,16 @@ Array = npt.NDArray[np.float64]
 #: photographs agree on there is believed as it is on the crowns.
 GUM_HEIGHT, GUM_TRUST = 20.0, 1.0
 #: Nor does a match have to be near where the crown shapes expect it: back teeth that one landmark
-#: each has placed may be several mm off. Detail (hence the stiffness) is left to the fit.
+#: each has placed may be several mm off. Small windows and less stiffness follow.
 ROUNDS = (
     SweepRound(reach=8.0, step=0.15, window=1.2, prior=0.1, stiffness=10.0),
-    SweepRound(reach=1.5, step=0.075, window=0.8, prior=0.15, stiffness=12.0),
+    SweepRound(reach=2.5, step=0.075, window=0.8, prior=0.1, stiffness=12.0),
+    SweepRound(reach=1.5, step=0.05, window=0.6, prior=0.1, stiffness=4.0),
+    SweepRound(reach=1.0, step=0.05, window=0.5, prior=0.1, stiffness=4.0),
 )
+#: Matches that are seen at a low angle (cosine) are still worth more than none. Gum may be further
+#: from the usual colour: what is no gum at all does not match.
+LEAST_FACING, GUM_DEVIATIONS = 0.2, 5.0
 #: Where no photographs agree, the charts are still mm and not cm off, unlike what is filled in
 #: around them: their confidence is 1 + exp of this.
 GUESS = -0.5
@@ -89,8 +94,9 @@ def from_known_teeth(
         x, y = centred[hint.photo].point(hint.x, hint.y)
         hints.append(replace(hint, x=x, y=y))
     surface = replace(
-        surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS
-    )
+        surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
+        least_facing=LEAST_FACING, gum_deviations=GUM_DEVIATIONS, carve=True,
+    )  # fmt: skip
     if config.dental.gum_height is None:
         surface = replace(surface, gum_height=GUM_HEIGHT)
     teeth = reconstruct_teeth(

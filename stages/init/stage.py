@@ -28,7 +28,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 4
+    version = 5
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -191,7 +191,10 @@ def _sweep(
     seen = [comparable(chart, photos, nearest, options) for chart in charts]
     for chart, shown in zip(charts, seen, strict=True):
         trust = chart.gum_fades(options.gum_trust)
-        found = sweep(chart.grid, chart.radius, photos, shown, pairs, trust, settings, options)
+        found = sweep(
+            chart.grid, chart.radius, photos, shown, pairs, trust,
+            chart.used(PAST_EDGE, options.gum_height), settings, options,
+        )  # fmt: skip
         chart.radius, chart.agreement = found.radius, found.weight
 
 

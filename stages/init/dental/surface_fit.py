@@ -18,9 +18,15 @@ _REWEIGHTINGS = 3
 
 
 def fit_offsets(
-    offset: Array32, weight: Array32, stiffness: float, anchor: float, outlier: float
+    offset: Array32,
+    weight: Array32,
+    stiffness: float,
+    anchor: float,
+    outlier: float,
+    held: Array32 | None = None,
+    target: Array32 | None = None,
 ) -> Array32:
-    """Minimise sum w (x - o)^2 + stiffness |D2 x|^2 + anchor x^2, robustly.
+    """Minimise sum w (x - o)^2 + h (x - t)^2 + stiffness |D2 x|^2 + anchor x^2, robustly.
 
     D2 are second differences (xx, yy and twice xy: the thin plate). Weights fall as
     1 / (1 + ((x - o) / outlier)^2) in iteratively reweighted least squares. Where there is no
@@ -32,6 +38,8 @@ def fit_offsets(
         stiffness: of the plate.
         anchor: pull to 0.
         outlier: scale of the reweighting, in the units of the offset.
+        held, target: [H, W] float32 weight >= 0 and offset t of what is no measurement, and never
+            an outlier.
 
     Returns:
         [H, W] float32.
@@ -48,11 +56,14 @@ def fit_offsets(
             if step:
                 trust = weight / (1 + ((fitted - offset) / np.float32(outlier)) ** 2)
             # Columns one after the other: the chart is wide, so that the band is narrow.
-            mass = _reduced(trust, size).T.ravel()
+            total, moment = trust, trust * offset
+            if held is not None and target is not None:
+                total, moment = total + held, moment + held * target
+            mass = _reduced(total, size).T.ravel()
             system = plate.copy()
             system[0] += mass + anchor
-            moment = _reduced(trust * offset, size).T.ravel()
-            field = solveh_banded(system, moment, lower=True, overwrite_ab=True)
+            right = _reduced(moment, size).T.ravel()
+            field = solveh_banded(system, right, lower=True, overwrite_ab=True)
             coarse = np.ascontiguousarray(field.reshape(cols, rows).T, np.float32)
             fitted = np.asarray(cv2.resize(coarse, shape, interpolation=cv2.INTER_CUBIC))
     return np.asarray(fitted, np.float32)

@@ -1,7 +1,8 @@
 """From the crowns out over the gum: strip by strip, each going on from the last as it bent.
 
 Only with cameras that are known exactly: the gum flares outwards where it turns into lip and cheek,
-further than a sweep around a straight wall reaches.
+further than a sweep around a straight wall reaches. Each strip is therefore tried at several
+slopes: correlation windows that lean like the gum agree best.
 """
 
 from __future__ import annotations
@@ -15,16 +16,23 @@ from scipy import ndimage
 
 from stages.init.dental.chart import ChartGrid
 from stages.init.dental.crown_shape import beyond_crowns
-from stages.init.dental.surface_charts import Chart, comparable, nearest_depths
+from stages.init.dental.surface_charts import PAST_EDGE, Chart, comparable, nearest_depths
 from stages.init.dental.surface_options import SurfaceOptions
 from stages.init.dental.surface_photo import Photo
-from stages.init.dental.surface_sweep import sweep
+from stages.init.dental.surface_sweep import Evidence, sweep
 
 Array32 = npt.NDArray[np.float32]
 
 #: The slope that a strip goes on with is taken over this height (mm) and smoothed along the arch
 #: over that length; steeper than this it does not get.
 _SLOPE_OVER, _SLOPE_ALONG, _STEEPEST = 2.0, 3.0, 1.5
+#: Slopes tried for a strip, relative to the last one's. Each costs agreement in proportion.
+_BENDS, _BEND_COST = (-0.4, 0.0, 0.5, 1.0), 0.02
+#: Agreement is compared over this length along the arch (mm); less than this decides nothing.
+_COMPARED_OVER, _LEAST_AGREEMENT = 4.0, 0.1
+#: The slopes chosen are smoothed over the first length (mm); where nothing was decided, what was
+#: decided within the second one counts, with the weight that follows.
+_BEND_NEAR, _BEND_FAR, _FAR_WEIGHT = 1.0, 14.0, 0.1
 #: A strip is swept together with so much of the last ones (mm), to be fitted to them.
 _OVERLAP = 5.0
 
@@ -51,16 +59,60 @@ def grow_gum(
         nearest = nearest_depths(charts, photos, further, threads)
         for chart in charts:
             part, rows = _strip(chart, reached - _OVERLAP, further)
-            seen = comparable(part, photos, nearest, limits)
-            trust = np.ones(part.radius.shape, np.float32)
-            found = sweep(
-                part.grid, part.radius, photos, seen, pairs, trust, options.grow_round, options
-            )
-            gum, _ = beyond_crowns(part.grid, part.shape)
+            grown = _sweep_strip(part, reached, photos, pairs, nearest, limits)
             # What is nearer to the crowns was swept before: go over to the new without a step.
+            gum, _ = beyond_crowns(part.grid, part.shape)
             new = np.clip((gum - np.float32(reached - _OVERLAP)) / np.float32(_OVERLAP), 0, 1)
-            chart.radius[rows] += new * (found.radius - part.radius)
+            chart.radius[rows] += new * (grown - part.radius)
         reached = further
+
+
+def _sweep_strip(
+    part: Chart, reached: float, photos: list[Photo], pairs: list[list[int]],
+    nearest: list[Array32], options: SurfaceOptions,
+) -> Array32:  # fmt: skip
+    """[H, W] radius of a strip, swept at the slope beyond `reached` at which it agrees best."""
+    gum, _ = beyond_crowns(part.grid, part.shape)
+    used = part.used(PAST_EDGE, options.gum_height)
+    beyond = np.maximum(gum - np.float32(reached), 0)
+    new = used & (beyond > 0)
+    trust = np.ones(part.radius.shape, np.float32)
+
+    def swept(bend: Array32 | float) -> Evidence:
+        bent = replace(part, radius=(part.radius + bend * beyond).astype(np.float32))
+        seen = comparable(bent, photos, nearest, options)
+        return sweep(
+            part.grid, bent.radius, photos, seen, pairs, trust, used, options.grow_round, options
+        )
+
+    count = np.maximum(new.sum(axis=0), 1)
+    agreements = [(swept(bend).weight * new).sum(axis=0) / count for bend in _BENDS]
+    return swept(best_bend(np.stack(agreements), part.grid.density)).radius
+
+
+def best_bend(agreement: npt.NDArray[np.floating], density: float) -> Array32:
+    """The bend, one of `_BENDS` or between them, for each column of a strip.
+
+    Args:
+        agreement: [B, W] of the photographs, 0..1, for each bend.
+        density: columns per mm.
+
+    Returns:
+        [W] float32: smooth; 0 where nothing agrees far around.
+    """
+    bends = np.array(_BENDS)
+    score = ndimage.gaussian_filter1d(agreement, _COMPARED_OVER * density, axis=1)
+    score = score - _BEND_COST * np.abs(bends)[:, None]
+    clear = score.max(axis=0) - np.median(score, axis=0)
+    clear = np.where(score.max(axis=0) > _LEAST_AGREEMENT, clear, 0)
+    chosen = clear * bends[score.argmax(axis=0)]
+
+    def around(values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        near = ndimage.gaussian_filter1d(values, _BEND_NEAR * density)
+        far = ndimage.gaussian_filter1d(values, _BEND_FAR * density)
+        return np.asarray(near + _FAR_WEIGHT * far)
+
+    return np.asarray(around(chosen) / np.maximum(around(clear), 1e-9), np.float32)
 
 
 def go_on_straight(chart: Chart, reached: float) -> None:

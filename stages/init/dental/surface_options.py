@@ -58,6 +58,9 @@ class SurfaceOptions:
     most_pair_angle: float = 65.0
     # partners, to either side, that a view is compared with
     partners: int = 1
+    # whether what no photographs agree on is kept out of the dark beside the jaws that others show;
+    # cameras must be exact for that
+    carve: bool = False
     # gum shown beyond the crowns, where photographs show gum
     gum_height: float = 4.0
     # with a larger gum_height the gum beyond this is swept strip by strip, each going on from the

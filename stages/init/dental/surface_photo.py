@@ -37,6 +37,9 @@ _WET = 30.0
 _LIT = 0.6
 #: Share of that size up to which a hole is a speck, bright or not.
 _SPECK = 0.02
+#: Darker than so much of the median of the teeth, over at least so many mm: nothing is there that a
+#: light beside the lens could reach.
+_VOID, _VOID_SIZE = 0.2, 1.0
 #: Gum in shade: that much darker (8-bit L) is no reason to call it something else.
 _GUM_SHADE = 25.0
 
@@ -56,6 +59,7 @@ class Photo:
         upper, lower: [H, W] float32 0 or 1: tooth of this jaw.
         upper_gum, lower_gum: [H, W] float32 0 or 1: gum of this jaw.
         dull: [H, W] float32: 1, and 0 in highlights.
+        void: [H, W] float32 0 or 1: so dark that nothing can be there, near or far.
         valid: [H, W] bool.
     """
 
@@ -70,6 +74,7 @@ class Photo:
     upper_gum: Array32
     lower_gum: Array32
     dull: Array32
+    void: Array32
     valid: Mask
 
     def tooth_of(self, jaw: Jaw) -> Array32:
@@ -146,7 +151,8 @@ def prepare_photo(
     density = placed.focal / max(float(pose[2, :3] @ middle + pose[2, 3]), 1.0)
     lab = _lab(image)
     tooth = dentition.mask & valid
-    gum = find_gum(lab, tooth, dentition, density, gum_deviations) & valid
+    void = find_void(lab[..., 0], tooth, density)
+    gum = find_gum(lab, tooth, dentition, density, gum_deviations) & valid & ~void
     shiny = highlights(image)
     return Photo(
         index=index,
@@ -160,6 +166,7 @@ def prepare_photo(
         upper_gum=(gum & dentition.above).astype(np.float32),
         lower_gum=(gum & ~dentition.above).astype(np.float32),
         dull=(1 - shiny).astype(np.float32),
+        void=(void & valid).astype(np.float32),
         valid=valid,
     )
 
@@ -226,6 +233,26 @@ def find_gum(
     touching[np.unique(label[tooth])] = True
     touching[0] = False
     return touching[label] & ~tooth
+
+
+def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:
+    """Where a photograph shows nothing but the dark around the jaws.
+
+    Args:
+        lightness: [H, W] float32, CIE L as in 8-bit images.
+        tooth: [H, W] bool.
+        density: pixels per mm.
+
+    Returns:
+        [H, W] bool; all False where no tooth is there to compare with.
+    """
+    if not tooth.any():
+        return np.zeros(tooth.shape, bool)
+    smooth = np.asarray(cv2.GaussianBlur(lightness, (0, 0), max(0.1 * density, 0.6)))
+    dark = (smooth < _VOID * np.median(smooth[tooth])) & ~tooth
+    size = max(round(_VOID_SIZE / 2 * density), 1)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    return np.asarray(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0)
 
 
 def _fill_bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:

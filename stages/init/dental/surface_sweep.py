@@ -15,6 +15,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from stages.init.dense.aggregate import aggregate, decide, edge_aware_penalty
+from stages.init.dental.carve import carved, in_void
 from stages.init.dental.chart import ChartGrid, normals_of
 from stages.init.dental.surface_fit import fit_offsets
 from stages.init.dental.surface_options import SurfaceOptions, SweepRound
@@ -33,6 +34,8 @@ _NEUTRAL = 0.55
 _LEAST_VARIANCE = 0.01
 #: The belief in the surface swept around grows no more beyond this (in units of `prior`).
 _MOST_PRIOR = 1.5
+#: Less agreement than this is none: there, silhouettes decide.
+_NO_AGREEMENT = 0.05
 #: How fast the jump penalty falls with the texture's gradient.
 _EDGE_FALLOFF = 2.0
 
@@ -185,6 +188,7 @@ def sweep(
     seen: npt.NDArray[np.bool_],
     pairs: list[list[int]],
     trust: Array32,
+    used: Mask,
     settings: SweepRound,
     options: SurfaceOptions,
 ) -> Evidence:
@@ -197,6 +201,7 @@ def sweep(
         seen: [V, H, W] bool: the photograph shows this sample.
         pairs: which photographs to compare with one another.
         trust: [H, W] float32: weight of what is found at a sample, 0..1.
+        used: [H, W] bool: samples that are surface, wherever it lies.
         settings: of this round.
         options: of the surface.
     """
@@ -218,9 +223,19 @@ def sweep(
     span = options.correlation_full - options.correlation_floor
     weight = np.clip((correlation - options.correlation_floor) / span, 0, 1) ** 2
     weight = np.where(both, weight * trust, 0).astype(np.float32)
-    fitted = fit_offsets(
-        offset.astype(np.float32), weight, settings.stiffness, options.anchor, options.outlier
-    )
+
+    def fit(held: Array32 | None, target: Array32 | None) -> Array32:
+        return fit_offsets(
+            offset.astype(np.float32), weight, settings.stiffness, options.anchor,
+            options.outlier, held, target,
+        )  # fmt: skip
+
+    if options.carve:
+        unmatched = used & (weight < _NO_AGREEMENT)
+        void = in_void(points, normals, offsets, photos) & unmatched[..., None]
+        fitted = carved(fit, void, offsets)
+    else:
+        fitted = fit(None, None)
     moved = points + fitted[..., None] * normals
     return Evidence(grid.radius_of(moved), weight)
 

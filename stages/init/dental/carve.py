@@ -1,0 +1,109 @@
+"""Silhouettes: no part of a chart may lie where a photograph shows that there is nothing.
+
+Crowns and gum that one photograph alone shows have no match, but the others have seen the dark
+beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from stages.init.dental.surface_photo import Photo
+
+Array32 = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+#: How often the chart is fitted anew to where it has to be.
+_ROUNDS = 5
+#: The weight by which it is held there, against 1 of a full correlation: it only has to bend what
+#: no match holds.
+_HOLD = 0.2
+
+
+def in_void(points: Array32, normals: Array32, offsets: Array32, photos: list[Photo]) -> Mask:
+    """Which offsets of a chart along its normals some photograph rules out.
+
+    Args:
+        points, normals: [H, W, 3] float32.
+        offsets: [D] float32, mm.
+        photos: with `Photo.void`.
+
+    Returns:
+        [H, W, D] bool.
+    """
+    found = np.zeros((*points.shape[:2], len(offsets)), bool)
+    for photo in photos:
+        if photo.void.any():
+            _mark(points, normals, offsets, photo.void, photo.camera.astype(np.float32), found)
+    return found
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _mark(points, normals, offsets, void, c, found):  # type: ignore[no-untyped-def]
+    rows, cols = points.shape[:2]
+    height, width = void.shape
+    for i in prange(rows):
+        for j in range(cols):
+            for d in range(offsets.shape[0]):
+                X = points[i, j, 0] + offsets[d] * normals[i, j, 0]
+                Y = points[i, j, 1] + offsets[d] * normals[i, j, 1]
+                Z = points[i, j, 2] + offsets[d] * normals[i, j, 2]
+                z = c[6] * X + c[7] * Y + c[8] * Z + c[11]
+                if z < np.float32(1):
+                    continue
+                x = c[12] * (c[0] * X + c[1] * Y + c[2] * Z + c[9]) / z + c[13]
+                y = c[12] * (c[3] * X + c[4] * Y + c[5] * Z + c[10]) / z + c[14]
+                if x >= 0 and y >= 0 and x < width and y < height and void[int(y), int(x)] > 0:
+                    found[i, j, d] = True
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _nearest_outside(void, plane, target):  # type: ignore[no-untyped-def]
+    """The nearest plane outside the void into `target` [H, W]; -1 where all planes are inside."""
+    rows, cols, count = void.shape
+    for i in prange(rows):
+        for j in range(cols):
+            at = plane[i, j]
+            target[i, j] = -1
+            for step in range(count):
+                if at - step >= 0 and not void[i, j, at - step]:
+                    target[i, j] = at - step
+                    break
+                if at + step < count and not void[i, j, at + step]:
+                    target[i, j] = at + step
+                    break
+
+
+def carved(
+    fit: Callable[[Array32 | None, Array32 | None], Array32], void: Mask, offsets: Array32
+) -> Array32:
+    """Fit a smooth field of offsets that keeps out of the void.
+
+    What lies inside is held at the nearest offset outside, and the field fitted
+    again, until all of it is outside or some rounds are over.
+
+    Args:
+        fit: offsets [H, W] float32 of weights [H, W] and targets [H, W] to hold them at.
+        void: [H, W, D] bool.
+        offsets: [D] float32, evenly spaced.
+    """
+    fitted = fit(None, None)
+    held, target = np.zeros_like(fitted), np.zeros_like(fitted)
+    nearest = np.empty(fitted.shape, np.int64)
+    step = offsets[1] - offsets[0]
+    for _ in range(_ROUNDS):
+        plane = np.rint((fitted - offsets[0]) / step).astype(np.int64)
+        plane = np.clip(plane, 0, len(offsets) - 1)
+        inside = np.take_along_axis(void, plane[..., None], 2)[..., 0]
+        if not inside.any():
+            break
+        _nearest_outside(void, plane, nearest)
+        inside &= nearest >= 0
+        held[inside] = _HOLD
+        target[inside] = offsets[nearest[inside]]
+        fitted = fit(held, target)
+    return fitted
