@@ -83,8 +83,8 @@ def carved(
 ) -> Array32:
     """Fit a smooth field of offsets that keeps out of the void.
 
-    What lies inside is held at the nearest offset outside, and the field fitted
-    again, until all of it is outside or some rounds are over.
+    What lies inside is held at the nearest offset outside, and the field fitted again, until all of
+    it is outside or some rounds are over.
 
     Args:
         fit: offsets [H, W] float32 of weights [H, W] and targets [H, W] to hold them at.

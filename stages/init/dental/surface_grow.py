@@ -19,9 +19,10 @@ from stages.init.dental.crown_shape import beyond_crowns
 from stages.init.dental.surface_charts import PAST_EDGE, Chart, comparable, nearest_depths
 from stages.init.dental.surface_options import SurfaceOptions
 from stages.init.dental.surface_photo import Photo
-from stages.init.dental.surface_sweep import Evidence, sweep
+from stages.init.dental.surface_sweep import match, sweep
 
 Array32 = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 #: The slope that a strip goes on with is taken over this height (mm) and smoothed along the arch
 #: over that length; steeper than this it does not get.
@@ -78,16 +79,17 @@ def _sweep_strip(
     new = used & (beyond > 0)
     trust = np.ones(part.radius.shape, np.float32)
 
-    def swept(bend: Array32 | float) -> Evidence:
-        bent = replace(part, radius=(part.radius + bend * beyond).astype(np.float32))
-        seen = comparable(bent, photos, nearest, options)
-        return sweep(
-            part.grid, bent.radius, photos, seen, pairs, trust, used, options.grow_round, options
-        )
+    def bent(bend: Array32 | float) -> tuple[Array32, list[Photo], Mask]:
+        chart = replace(part, radius=(part.radius + bend * beyond).astype(np.float32))
+        return chart.radius, photos, comparable(chart, photos, nearest, options)
 
     count = np.maximum(new.sum(axis=0), 1)
-    agreements = [(swept(bend).weight * new).sum(axis=0) / count for bend in _BENDS]
-    return swept(best_bend(np.stack(agreements), part.grid.density)).radius
+    agreements = []
+    for bend in _BENDS:
+        found = match(part.grid, *bent(bend), pairs, trust, options.grow_round, options)
+        agreements.append((found.weight * new).sum(axis=0) / count)
+    best = bent(best_bend(np.stack(agreements), part.grid.density))
+    return sweep(part.grid, *best, pairs, trust, used, options.grow_round, options).radius
 
 
 def best_bend(agreement: npt.NDArray[np.floating], density: float) -> Array32:

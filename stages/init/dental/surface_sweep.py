@@ -53,6 +53,24 @@ class Evidence:
     weight: Array32
 
 
+@dataclass(frozen=True)
+class Matches:
+    """Offsets of a chart along its normals at which photographs agree, before any fit.
+
+    Attributes:
+        points, normals: [H, W, 3] float32 the chart and where it is moved along.
+        offsets: [D] float32 those tried, mm.
+        offset: [H, W] float32 the best one.
+        weight: [H, W] float32 0..1: how well the photographs agree there.
+    """
+
+    points: Array32
+    normals: Array32
+    offsets: Array32
+    offset: Array32
+    weight: Array32
+
+
 @njit(cache=True, error_model="numpy", fastmath=True)
 def _bilinear(image, height, width, x, y):  # type: ignore[no-untyped-def]
     x = min(max(x - np.float32(0.5), np.float32(0)), np.float32(width - 1.001))
@@ -205,6 +223,34 @@ def sweep(
         settings: of this round.
         options: of the surface.
     """
+    found = match(grid, radius, photos, seen, pairs, trust, settings, options)
+
+    def fit(held: Array32 | None, target: Array32 | None) -> Array32:
+        return fit_offsets(
+            found.offset, found.weight, settings.stiffness, options.anchor, options.outlier,
+            held, target,
+        )  # fmt: skip
+
+    if options.carve:
+        unmatched = used & (found.weight < _NO_AGREEMENT)
+        void = in_void(found.points, found.normals, found.offsets, photos) & unmatched[..., None]
+        fitted = carved(fit, void, found.offsets)
+    else:
+        fitted = fit(None, None)
+    return Evidence(grid.radius_of(found.points + fitted[..., None] * found.normals), found.weight)
+
+
+def match(
+    grid: ChartGrid,
+    radius: Array32,
+    photos: list[Photo],
+    seen: npt.NDArray[np.bool_],
+    pairs: list[list[int]],
+    trust: Array32,
+    settings: SweepRound,
+    options: SurfaceOptions,
+) -> Matches:
+    """Sweep around a chart and decide at each sample; arguments as for `sweep`."""
     points = grid.points(radius)
     smooth = cv2.GaussianBlur(radius, (0, 0), _NORMAL_SMOOTHING * grid.density)
     normals = normals_of(grid.points(np.asarray(smooth, np.float32)))
@@ -223,21 +269,7 @@ def sweep(
     span = options.correlation_full - options.correlation_floor
     weight = np.clip((correlation - options.correlation_floor) / span, 0, 1) ** 2
     weight = np.where(both, weight * trust, 0).astype(np.float32)
-
-    def fit(held: Array32 | None, target: Array32 | None) -> Array32:
-        return fit_offsets(
-            offset.astype(np.float32), weight, settings.stiffness, options.anchor,
-            options.outlier, held, target,
-        )  # fmt: skip
-
-    if options.carve:
-        unmatched = used & (weight < _NO_AGREEMENT)
-        void = in_void(points, normals, offsets, photos) & unmatched[..., None]
-        fitted = carved(fit, void, offsets)
-    else:
-        fitted = fit(None, None)
-    moved = points + fitted[..., None] * normals
-    return Evidence(grid.radius_of(moved), weight)
+    return Matches(points, normals, offsets, offset.astype(np.float32), weight)
 
 
 def matching_cost(
