@@ -4,8 +4,8 @@ Gaussians that each move on their own can't correct a surface: one image always 
 other, and there are a thousand ways to give in. What all of them within a millimetre or two want
 together is well determined. The surface moves along its normals by a smooth field (B-splines of
 several widths), and its normals turn along, so that shading and highlights shape it as well as
-texture. Preconditioning of this kind is what inverse rendering
-of meshes lives by (Nicolet et al. 2021, "Large Steps in Inverse Rendering of Geometry").
+texture. Preconditioning of this kind is what inverse rendering of meshes lives by (Nicolet et al.
+2021, "Large Steps in Inverse Rendering of Geometry").
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from stages.init.dense.aggregate import aggregate, decide, edge_aware_penalty
-from stages.init.dental.carve import carved, in_void
 from stages.init.dental.chart import ChartGrid, normals_of
+from stages.init.dental.surface_carve import carved, in_void
 from stages.init.dental.surface_fit import fit_offsets
 from stages.init.dental.surface_options import SurfaceOptions, SweepRound
 from stages.init.dental.surface_photo import Photo

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stages.init.dental import surface_grow
-from stages.init.dental.carve import carved, in_void
 from stages.init.dental.chart import ChartGrid, normals_of
+from stages.init.dental.surface_carve import carved, in_void
 from stages.init.dental.surface_fit import fit_offsets
 from stages.init.dental.surface_grow import best_bend
 from stages.init.dental.surface_photo import find_void
