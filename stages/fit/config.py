@@ -99,7 +99,11 @@ class FitConfig(StageConfig):
         "0.04 on a held surface)",
     )
     light_gamma: float = number(2.2, "exponent of the photographs' encoding", ge=1, le=4)
-    light_albedo_lr: Auto | float = number(AUTO, "learning rate of albedos")
+    light_albedo_lr: Auto | float = number(
+        AUTO,
+        "learning rate of albedos (auto: 0.0014; 0.0042 from 6 views; 0.005 on a held surface, "
+        "where neighbours pass on to one another what they are)",
+    )
     light_normal_lr: Auto | float = number(
         AUTO, "learning rate of the normals that are lit (auto: 0.005; 0.002 on a held surface)"
     )
@@ -144,6 +148,15 @@ class FitConfig(StageConfig):
         AUTO,
         "weight of the depth prior from the input points, in units of the scene's depth; 0: none "
         "(auto: 0.5, 0.3 from 6 views, none on a held surface)",
+    )
+    lambda_albedo: Auto | float = number(
+        AUTO,
+        "weight of the mean difference between the albedos of neighbouring Gaussians, with a light "
+        "beside the lens; 0: none (auto: 0.2 on a held surface, else none)",
+    )
+    albedo_neighbours: int = number(24, "Gaussians that each is compared with", ge=1, le=64)
+    albedo_tolerance: float = number(
+        0.02, "differences of albedo below this count by their squares only", gt=0
     )
     coarse_fraction: float = number(0.6, "share of the iterations at reduced size", ge=0, le=1)
     coarse_factor: int = number(2, "by which factor images are reduced then", ge=1, le=8)
@@ -314,7 +327,7 @@ class FitConfig(StageConfig):
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
             "light_strength_lr": 0, "light_normal_lr": 0, "fill_share": 0,
-            "warp_lr_init": 0, "warp_lr_final": 0, "warp_slope": 1e-3,
+            "warp_lr_init": 0, "warp_lr_final": 0, "warp_slope": 1e-3, "lambda_albedo": 0,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0

@@ -56,6 +56,9 @@ class FitSettings:
     lambda_dssim: float
     lambda_flow: float
     lambda_depth: float
+    lambda_albedo: float
+    albedo_neighbours: int
+    albedo_tolerance: float
     coarse_fraction: float
     coarse_factor: int
     position_lr_init: float
@@ -158,6 +161,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
         "lambda_depth": 0.3 if many else 0.5,
+        "lambda_albedo": 0.0,
         "warp_lr_init": 1e-4,
         "warp_lr_final": 1e-5,
         "pose_lr_init": 3e-4,
@@ -176,6 +180,8 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
             "light_strengths": (0.3, 0.04),
             "light_strength_lr": 0.0,
             "lambda_depth": 0.0,
+            "lambda_albedo": 0.2,
+            "light_albedo_lr": 5e-3,
             "warp_lr_init": 3e-4,
             "warp_lr_final": 1e-4,
         }

@@ -185,6 +185,7 @@ class Trainer:
         done = self.iteration / s.iterations
         if self.light is not None:
             by_pose = by_pose + self.light.step(self.packed, viewpoint, gradients, done)
+            loss += self.light.loss
         if not np.isfinite(loss) or not np.isfinite(by_pose).all():
             raise self.diverged(f"its loss is not a number any more (view {view})")
         self._step_gaussians(gradients)
