@@ -149,14 +149,14 @@ class FitConfig(StageConfig):
         "weight of the depth prior from the input points, in units of the scene's depth; 0: none "
         "(auto: 0.5, 0.3 from 6 views, none on a held surface)",
     )
-    lambda_albedo: Auto | float = number(
+    lambda_tv: Auto | float = number(
         AUTO,
-        "weight of the mean difference between the albedos of neighbouring Gaussians, with a light "
-        "beside the lens; 0: none (auto: 0.2 on a held surface, else none)",
+        "weight of the mean difference between the colours of neighbouring Gaussians: albedos with "
+        "a light beside the lens, else harmonics (auto: 0.2 on a held surface, else none)",
     )
-    albedo_neighbours: int = number(24, "Gaussians that each is compared with", ge=1, le=64)
-    albedo_tolerance: float = number(
-        0.02, "differences of albedo below this count by their squares only", gt=0
+    tv_neighbours: int = number(24, "Gaussians that each is compared with", ge=1, le=64)
+    tv_tolerance: float = number(
+        0.02, "differences of colour below this count by their squares only", gt=0
     )
     coarse_fraction: float = number(0.6, "share of the iterations at reduced size", ge=0, le=1)
     coarse_factor: int = number(2, "by which factor images are reduced then", ge=1, le=8)
@@ -327,7 +327,7 @@ class FitConfig(StageConfig):
             "pose_lr_init": 0, "pose_lr_final": 0, "densify_until_iter": 0, "max_gaussians": 1,
             "trusted_confidence": 1, "sh_degree": 0, "final_prune_masked": 0,
             "light_strength_lr": 0, "light_normal_lr": 0, "fill_share": 0,
-            "warp_lr_init": 0, "warp_lr_final": 0, "warp_slope": 1e-3, "lambda_albedo": 0,
+            "warp_lr_init": 0, "warp_lr_final": 0, "warp_slope": 1e-3, "lambda_tv": 0,
         }  # fmt: skip
         if self.progressive:
             plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Light
 from stages.fit.checkpoint import Arrays
-from stages.fit.even_albedo import EvenAlbedo
 from stages.fit.initial import Cloud, facing
 from stages.fit.settings import FitSettings
 from stages.fit.targets import point_depth
+from stages.fit.total_variation import TotalVariation
 from stages.splatting.adam import Adam
 from stages.splatting.light import shade, shade_backward
 from stages.splatting.rasterizer import Gradients, Viewpoint
@@ -40,8 +40,6 @@ class LensLight:
         material: [N, 6] float32, albedo and normal.
         values: [6] float64: k, p, m and s of the narrow lobe, m and s of the broad one.
         by_normal: [N, 3] float32 gradient of the last step by the normals.
-        evenness: draws the albedos of neighbours together.
-        loss: of that, in the last step.
     """
 
     def __init__(self, material: Floats, settings: FitSettings) -> None:
@@ -56,8 +54,6 @@ class LensLight:
         self.first, self.second = np.zeros(6), np.zeros(6)
         self.radiance = np.empty((0, 3), np.float32)
         self.by_normal: Floats = np.empty((0, 3), np.float32)
-        self.evenness = EvenAlbedo(s.lambda_albedo, s.albedo_neighbours, s.albedo_tolerance)
-        self.loss = 0.0
 
     def coefficients(self) -> Floats:
         """[8] for `shade`. In the frame of a fit the scene's depth is 1: the falloff's distance."""
@@ -68,13 +64,15 @@ class LensLight:
         self.radiance = shade(packed, self.material, viewpoint.centre, self.coefficients())
 
     def step(
-        self, packed: Floats, viewpoint: Viewpoint, gradients: Gradients, done: float
-    ) -> Array:
+        self, packed: Floats, viewpoint: Viewpoint, gradients: Gradients,
+        variation: TotalVariation, done: float,
+    ) -> Array:  # fmt: skip
         """One step of material and light after `shade` and the rasterizer's backward pass.
 
         Args:
             packed, viewpoint: as `shade` had and left them.
             gradients: of the rasterizer; what reaches the positions is added.
+            variation: of the albedos.
             done: share of the fit that is over, 0..1; rates fall with it.
 
         Returns:
@@ -86,7 +84,7 @@ class LensLight:
             self.radiance, gradients.packed,
         )  # fmt: skip
         gradients.packed[:, 11:14] = 0
-        self.loss = self.evenness.add(packed[:, :3], self.material, result.material)
+        variation.add(packed[:, :3], self.material, 0, 3, result.material)
         fall = s.light_lr_decay**done
         rates = np.empty(6, np.float32)
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall
@@ -130,7 +128,6 @@ class LensLight:
         """Rows follow those of the packed scene (see `Trainer.replace`)."""
         self.material = np.ascontiguousarray(self.material[source])
         self.adam.select(source, fresh)
-        self.evenness.forget()
 
     def light(self, scale: float) -> Light:
         """What was fitted, with lengths in units of 1 / `scale`."""
@@ -149,7 +146,6 @@ class LensLight:
             "light_values": self.values,
             "light_first": self.first,
             "light_second": self.second,
-            **self.evenness.arrays(),
         }
 
     def restore(self, arrays: Arrays, steps: int) -> None:
@@ -160,7 +156,6 @@ class LensLight:
         self.adam.steps = steps
         self.values = arrays["light_values"]
         self.first, self.second = arrays["light_first"], arrays["light_second"]
-        self.evenness.restore(arrays)
 
 
 def initial_material(

@@ -116,5 +116,6 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         trainer.extent, colours_only,
     )  # fmt: skip
     second.exposure.values = trainer.exposure.values
+    second.variation = trainer.variation
     second.run(None, lambda *_: None)
     return second

@@ -56,9 +56,9 @@ class FitSettings:
     lambda_dssim: float
     lambda_flow: float
     lambda_depth: float
-    lambda_albedo: float
-    albedo_neighbours: int
-    albedo_tolerance: float
+    lambda_tv: float
+    tv_neighbours: int
+    tv_tolerance: float
     coarse_fraction: float
     coarse_factor: int
     position_lr_init: float
@@ -161,7 +161,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
         "densify": many,
         "max_gaussians": 60000 if many else 15000,
         "lambda_depth": 0.3 if many else 0.5,
-        "lambda_albedo": 0.0,
+        "lambda_tv": 0.0,
         "warp_lr_init": 1e-4,
         "warp_lr_final": 1e-5,
         "pose_lr_init": 3e-4,
@@ -169,7 +169,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
     }
     if held:
         chosen |= {
-            "iterations": 600,
+            "iterations": 500,
             "initial_points": 60000,
             "trusted_confidence": 1.0,
             "sh_degree": 2,
@@ -180,7 +180,7 @@ def automatic(views: int, held: bool = False) -> dict[str, Any]:
             "light_strengths": (0.3, 0.04),
             "light_strength_lr": 0.0,
             "lambda_depth": 0.0,
-            "lambda_albedo": 0.2,
+            "lambda_tv": 0.2,
             "light_albedo_lr": 5e-3,
             "warp_lr_init": 3e-4,
             "warp_lr_final": 1e-4,

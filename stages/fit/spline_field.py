@@ -162,7 +162,12 @@ def _numbered(cells: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Inte
     low = flat.min(axis=0)
     size = flat.max(axis=0) - low + 1
     keys = ((flat[:, 0] - low[0]) * size[1] + flat[:, 1] - low[1]) * size[2] + flat[:, 2] - low[2]
-    distinct, index = np.unique(keys, return_inverse=True)
+    # faster than `numpy.unique`, which hashes
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    new = np.diff(ordered, prepend=ordered[0] - 1) > 0
+    distinct, index = ordered[new], np.empty(len(keys), np.int64)
+    index[order] = np.cumsum(new) - 1
     lattice = np.stack([distinct // (size[1] * size[2]), distinct // size[2] % size[1],
                         distinct % size[2]], axis=1) + low  # fmt: skip
     return lattice, index.reshape(cells.shape[:-1]).astype(np.int32)

@@ -30,6 +30,7 @@ def save_state(trainer: Trainer, path: Path) -> None:
         "exposure": trainer.exposure.values,
         "exposure_moments": trainer.exposure.moments,
         "curve": np.array(trainer.curve, np.float64).reshape(-1, 4),
+        **trainer.variation.arrays(),
         **(trainer.light.arrays() if trainer.light is not None else {}),
         **(trainer.held_surface.arrays() if trainer.held_surface is not None else {}),
         **(trainer.warp.arrays() if trainer.warp is not None else {}),
@@ -65,6 +66,7 @@ def restore_state(trainer: Trainer, path: Path) -> bool:
     trainer.poses.steps = arrays["pose_steps"]
     trainer.exposure.values = arrays["exposure"]
     trainer.exposure.moments = arrays["exposure_moments"]
+    trainer.variation.restore(arrays)
     if trainer.light is not None:
         trainer.light.restore(arrays, facts["adam_steps"])
     if trainer.held_surface is not None:

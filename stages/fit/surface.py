@@ -11,14 +11,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.checkpoint import Arrays
 from stages.fit.warp import turned
+from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
-
+F = np.float32
 
 #: up to so many views, a surface can be held
 FEW_VIEWS = 3
@@ -59,6 +61,23 @@ def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
     ahead = np.tile(np.array([0.0, 0.0, 1.0]), (len(unturned), 1))
     packed[known, 3:7] = turned(unturned, ahead, normals[known])
     packed[known, 9] += np.float32(np.log(flatness))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _pull(packed: Floats, anchor: Floats, turn: Floats):  # type: ignore[no-untyped-def]
+    """`HeldSurface.pull`; arrays as it has them."""
+    for i in prange(len(packed)):
+        firmness, widest = anchor[i, 7], anchor[i, 8]
+        off = F(0)
+        for k in range(3):
+            off += (packed[i, k] - anchor[i, k]) * anchor[i, 3 + k]
+        for k in range(3):
+            packed[i, k] -= off * firmness * anchor[i, 3 + k]
+        for k in range(4):
+            packed[i, 3 + k] += firmness * (turn[i, k] - packed[i, 3 + k])
+        packed[i, 9] += firmness * (anchor[i, 6] - packed[i, 9])
+        for k in range(7, 10):
+            packed[i, k] = min(packed[i, k], widest)
 
 
 class HeldSurface:
@@ -103,12 +122,8 @@ class HeldSurface:
 
     def pull(self, packed: Floats) -> None:
         """Draw Gaussians back onto their surface: position, turn, thickness; bound the width."""
-        normal, firmness = self.anchor[:, 3:6], self.anchor[:, 7]
-        off = ((packed[:, :3] - self.anchor[:, :3]) * normal).sum(1) * firmness
-        packed[:, :3] -= off[:, None] * normal
-        packed[:, 3:7] += firmness[:, None] * (self.turn - packed[:, 3:7])
-        packed[:, 9] += firmness * (self.anchor[:, 6] - packed[:, 9])
-        np.minimum(packed[:, 7:10], self.anchor[:, 8:9], out=packed[:, 7:10])
+        with KERNELS:
+            _pull(packed, self.anchor, self.turn)
 
     def select(self, source: npt.NDArray[np.int64]) -> None:
         """Rows follow those of the packed scene."""

@@ -25,8 +25,10 @@ from stages.fit.settings import FitSettings
 from stages.fit.state import restore_state, save_state
 from stages.fit.surface import HeldSurface
 from stages.fit.targets import Target
+from stages.fit.total_variation import TotalVariation
 from stages.fit.warp import Warp, turned
 from stages.splatting.adam import Adam
+from stages.splatting.harmonics import C0
 from stages.splatting.projection import HARMONICS
 from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint, rasterize
 
@@ -45,6 +47,7 @@ class Trainer:
     Attributes:
         packed: [N, 11 + 3 K] float32 Gaussians.
         poses: the cameras' optimiser, which holds the poses.
+        variation: draws the colours of neighbours together.
         iteration: steps taken.
         psnr, loss: running means over recent iterations.
     """
@@ -85,6 +88,8 @@ class Trainer:
         self.packed = packed
         self.poses = PoseOptimizer(poses, held)
         self.adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
+        s = settings
+        self.variation = TotalVariation(s.lambda_tv, s.tv_neighbours, s.tv_tolerance)
         self.statistics = DensityStatistics.empty(len(packed))
         self.exposure = Exposure(len(poses))
         self.background = Background(settings, targets)
@@ -184,8 +189,9 @@ class Trainer:
         by_pose = gradients.pose
         done = self.iteration / s.iterations
         if self.light is not None:
-            by_pose = by_pose + self.light.step(self.packed, viewpoint, gradients, done)
-            loss += self.light.loss
+            by_pose = by_pose + self.light.step(
+                self.packed, viewpoint, gradients, self.variation, done
+            )
         if not np.isfinite(loss) or not np.isfinite(by_pose).all():
             raise self.diverged(f"its loss is not a number any more (view {view})")
         self._step_gaussians(gradients)
@@ -267,6 +273,10 @@ class Trainer:
         s = self.settings
         gradient = gradients.packed
         add_regularisers(self.packed, gradient, s.opacity_reg, s.scale_reg)
+        if self.light is None:
+            self.variation.add(
+                self.packed[:, :3], self.packed, HARMONICS, self.packed.shape[1], gradient, C0
+            )
         if s.isotropic:
             gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
         rates = self.rates()
@@ -351,6 +361,7 @@ class Trainer:
         """Put other rows in place; the optimiser's rows follow `source`."""
         self.packed = packed
         self.adam.select(source, fresh)
+        self.variation.forget()
         if self.light is not None:
             self.light.select(source, fresh)
         if self.held_surface is not None:

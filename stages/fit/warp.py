@@ -10,14 +10,17 @@ texture. Preconditioning of this kind is what inverse rendering of meshes lives 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit, prange
 
 from stages.fit.checkpoint import Arrays
 from stages.fit.spline_field import SplineField
 from stages.splatting.adam import Adam
+from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -78,12 +81,11 @@ class Warp:
 
     def collect(self, by_position: Floats, by_normal: Floats | None) -> None:
         """Add a photograph's gradients [N, 3] by where Gaussians are and what they face."""
-        normals = self.normals
-        self.gradient[:, 0] += (by_position * normals).sum(1)
-        if by_normal is not None:
-            # a slope of the displacement turns the normal against it
-            along = (by_normal * normals).sum(1, keepdims=True)
-            self.gradient[:, 1:] -= by_normal - along * normals
+        lit = by_normal is not None
+        with KERNELS:
+            _collect(
+                by_position, by_normal if lit else by_position, lit, self.normals, self.gradient
+            )
         self.collected += 1
 
     def move(self, rate: float) -> Bent | None:
@@ -101,20 +103,12 @@ class Warp:
         self.adam.step(self.field.coefficients[:, None], gradient[:, None], rates)
         self.gradient[:] = 0
         self.collected = 0
-        shape = self._shape()
-        change = shape - self.shape
-        self.shape = shape
-        facing = self.normals + shape[:, 1:]
-        length = np.linalg.norm(facing, axis=1, keepdims=True)
-        self.facing = facing / np.maximum(length, F(1e-12))
-        return Bent(change[:, :1] * self.normals, change[:, 1:])
-
-    def _shape(self) -> Floats:
-        """[N, 4] displacement along the first normals, and what that adds to them."""
+        move, lean, facing = (np.empty_like(self.normals) for _ in range(3))
         displacement, slope = self.field.evaluate()
-        known = np.abs(self.normals).sum(1, keepdims=True) > 0
-        lean = (slope * self.normals).sum(1, keepdims=True) * self.normals - slope
-        return np.concatenate([displacement[:, None], lean], 1) * known
+        with KERNELS:
+            _bend(displacement, slope, self.normals, self.shape, move, lean, facing)
+        self.facing = facing
+        return Bent(move, lean)
 
     def reach(self) -> float:
         """By how much 95 % of the surface has moved at most, in units of the frame."""
@@ -152,25 +146,81 @@ class Warp:
         self.adam.steps, self.collected = (int(n) for n in arrays["warp_steps"])
 
 
+@njit(parallel=True, cache=True, error_model="numpy")
+def _collect(  # type: ignore[no-untyped-def]
+    by_position: Floats, by_normal: Floats, lit: bool, normals: Floats, gradient: Floats
+):
+    """Add what a photograph says to the gradient [N, 4] by displacement and lean."""
+    for i in prange(len(normals)):
+        along, outward = F(0), F(0)
+        for k in range(3):
+            outward += by_position[i, k] * normals[i, k]
+            along += by_normal[i, k] * normals[i, k]
+        gradient[i, 0] += outward
+        if lit:
+            # a slope of the displacement turns the normal against it
+            for k in range(3):
+                gradient[i, 1 + k] -= by_normal[i, k] - along * normals[i, k]
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _bend(  # type: ignore[no-untyped-def]
+    displacement: Floats, slope: Floats, normals: Floats, shape: Floats, move: Floats,
+    lean: Floats, facing: Floats,
+):  # fmt: skip
+    """What a field [N] and its gradient [N, 3] make of a surface; `shape` is brought up to date."""
+    for i in prange(len(normals)):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        known = F(1) if x != F(0) or y != F(0) or z != F(0) else F(0)
+        along = slope[i, 0] * x + slope[i, 1] * y + slope[i, 2] * z
+        outward = displacement[i] * known
+        square = F(0)
+        for k in range(3):
+            added = (along * normals[i, k] - slope[i, k]) * known
+            move[i, k] = (outward - shape[i, 0]) * normals[i, k]
+            lean[i, k] = added - shape[i, 1 + k]
+            shape[i, 1 + k] = added
+            facing[i, k] = normals[i, k] + added
+            square += facing[i, k] * facing[i, k]
+        shape[i, 0] = outward
+        length = max(math.sqrt(square), F(1e-12))
+        for k in range(3):
+            facing[i, k] /= length
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _turned(  # type: ignore[no-untyped-def]
+    quaternions: Floats, first: Floats, second: Floats, result: Floats
+):
+    for i in prange(len(quaternions)):
+        ax, ay, az = first[i, 0], first[i, 1], first[i, 2]
+        bx, by, bz = second[i, 0], second[i, 1], second[i, 2]
+        w = F(1) + ax * bx + ay * by + az * bz
+        x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        if w < F(1e-6):
+            # an axis across them: the cross product with the axis that they are furthest from
+            w = F(0)
+            if abs(ax) <= abs(ay) and abs(ax) <= abs(az):
+                x, y, z = F(0), az, -ay
+            elif abs(ay) <= abs(az):
+                x, y, z = -az, F(0), ax
+            else:
+                x, y, z = ay, -ax, F(0)
+        length = math.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w / length, x / length, y / length, z / length
+        a, b, c, d = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+        result[i, 0] = w * a - x * b - y * c - z * d
+        result[i, 1] = w * b + x * a + y * d - z * c
+        result[i, 2] = w * c - x * d + y * a + z * b
+        result[i, 3] = w * d + x * c - y * b + z * a
+
+
 def turned(quaternions: Floats, first: Floats, second: Floats) -> Floats:
     """Quaternions [N, 4] after the shortest turn that takes unit vectors `first` to `second`.
 
     Between opposite vectors it is one of the half turns; vectors of 0 turn nothing.
     """
-    turn = np.concatenate([1 + (first * second).sum(1, keepdims=True), np.cross(first, second)], 1)
-    opposite = turn[:, 0] < 1e-6
-    # an axis across them: the cross product with the axis that they are furthest from
-    furthest = np.eye(3)[np.abs(first[opposite]).argmin(1)]
-    turn[opposite, 0], turn[opposite, 1:] = 0, np.cross(first[opposite], furthest)
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-    w, x, y, z = turn.T
-    a, b, c, d = quaternions.T
-    return np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=1,
-    ).astype(np.float32)
+    result = np.empty((len(quaternions), 4), np.float32)
+    with KERNELS:
+        _turned(*(np.asarray(array, np.float32) for array in (quaternions, first, second)), result)
+    return result

@@ -63,14 +63,13 @@ def test_nothing_of_our_own_is_in_the_paper_and_its_baselines(name: str) -> None
         "light": "none", "headlight": 0.0, "lambda_depth": 0.0, "coarse_fraction": 0.0,
         "hold_surface": False, "warp_levels": 0, "fill_share": 1.0, "trusted_confidence": 1.0,
         "normal_neighbours": 0, "initial_opacity": 0.1, "initial_scale": 1.0, "sh_degree": 3,
-        "exposure": False, "strategy": "default",
+        "exposure": False, "strategy": "default", "lambda_tv": 0.0,
     }  # fmt: skip
     assert {key: fit[key] for key in off} == off
     assert fit["saturation"] > 1
     # the same with any number of views: our own schedule does not reach them
     decided = {key for key, value in fit.items() if value == "auto"}
-    light = {"light_albedo_lr", "light_normal_lr", "light_strengths", "light_strength_lr",
-             "lambda_albedo"}  # fmt: skip
+    light = {"light_albedo_lr", "light_normal_lr", "light_strengths", "light_strength_lr"}
     assert decided <= light | {"pose_lr_init", "pose_lr_final"}
     assert fit["optimize_poses"] is False or not decided & {"pose_lr_init", "pose_lr_final"}
     assert ("flow" in config.run.stages) == (fit["lambda_flow"] > 0)

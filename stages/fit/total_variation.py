@@ -1,0 +1,154 @@
+"""Neighbours mostly have the same colour: what changes from one to the next is more often shading.
+
+A photograph alone can't tell a dark tissue from one that is turned away, and what no other one has
+seen from there, a Gaussian may have in any colour. Intrinsic images settle it by a prior: albedo is
+piecewise even (Land and McCann 1971, "Lightness and Retinex Theory"). Here it is the total
+variation over a graph of neighbours (Rudin, Osher and Fatemi 1992), rounded off near 0 (Huber).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+from scipy.spatial import cKDTree
+
+from stages.fit.checkpoint import Arrays
+from stages.splatting.lanes import (
+    WIDTH,
+    at_least,
+    at_most,
+    count_up,
+    load_from,
+    spread,
+    store_from,
+    where,
+)
+from stages.splatting.threads import KERNELS
+
+Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
+F = np.float32
+CHUNK = 256
+
+
+@njit(inline="always")
+def _slope(difference):  # type: ignore[no-untyped-def]
+    return min(max(difference, F(-1)), F(1))
+
+
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=True)
+def _few_columns(  # type: ignore[no-untyped-def]
+    values: Floats, first: int, last: int, neighbours: Integers, starts: Integers,
+    inverse: np.float32, weight: np.float32, gradient: Floats,
+):  # fmt: skip
+    """Three columns at a time."""
+    for chunk in prange((len(values) + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(len(values), (chunk + 1) * CHUNK)):
+            for k in range(first, last, 3):
+                a, b, c = values[i, k], values[i, k + 1], values[i, k + 2]
+                by_a, by_b, by_c = F(0), F(0), F(0)
+                for edge in range(starts[i], starts[i + 1]):
+                    j = neighbours[edge]
+                    by_a += _slope((a - values[j, k]) * inverse)
+                    by_b += _slope((b - values[j, k + 1]) * inverse)
+                    by_c += _slope((c - values[j, k + 2]) * inverse)
+                gradient[i, k] += weight * by_a
+                gradient[i, k + 1] += weight * by_b
+                gradient[i, k + 2] += weight * by_c
+
+
+@njit(parallel=True, cache=True, error_model="numpy", fastmath=True)
+def _many_columns(  # type: ignore[no-untyped-def]
+    values: Floats, first: int, last: int, neighbours: Integers, starts: Integers,
+    inverse: np.float32, weight: np.float32, gradient: Floats,
+):  # fmt: skip
+    """Sixteen columns at a time; the last sixteen may overlap with those before."""
+    stride, columns = values.shape[1], last - first
+    blocks = (columns + WIDTH - 1) // WIDTH
+    for chunk in prange((len(values) + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(len(values), (chunk + 1) * CHUNK)):
+            for block in range(blocks):
+                start = min(block * WIDTH, columns - WIDTH)
+                place = i * stride + first + start
+                own = load_from(values, place)
+                total = spread(F(0))
+                for edge in range(starts[i], starts[i + 1]):
+                    other = load_from(values, neighbours[edge] * stride + first + start)
+                    total += at_most(at_least((own - other) * inverse, F(-1)), F(1))
+                done = F(block * WIDTH - start)
+                total = where(count_up() < done, spread(F(0)), total)
+                store_from(gradient, place, load_from(gradient, place) + total * weight)
+
+
+class TotalVariation:
+    """Weight times the mean, over Gaussians and their neighbours, of how their colours differ.
+
+    Attributes:
+        neighbours, starts: the graph's edges from both ends: those of Gaussian i are
+            neighbours[starts[i]:starts[i + 1]]; None until they are needed.
+    """
+
+    def __init__(self, weight: float, neighbours: int, tolerance: float) -> None:
+        """
+        Args:
+            weight: against a colour loss that is a mean over the pixels.
+            neighbours: a Gaussian is compared to so many of the nearest, and with those that it is
+                one of the nearest to.
+            tolerance: differences of colour below this count by their squares.
+        """
+        self.weight = weight
+        self.count = neighbours
+        self.tolerance = tolerance
+        self.neighbours: Integers | None = None
+        self.starts: Integers = np.zeros(1, np.int32)
+
+    def add(
+        self, positions: Floats, values: Floats, first: int, last: int, gradient: Floats,
+        unit: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Add to the gradient by some columns.
+
+        Args:
+            positions: [N, 3]; the graph is that of the positions when it is first asked for.
+            values: [N, D] contiguous, of which columns `first` to `last` - 1 are colours, three each.
+            gradient: [N, D] contiguous.
+            unit: the colour that 1 in these columns is.
+        """
+        number = len(values)
+        if self.weight == 0 or number <= 1:
+            return
+        if self.neighbours is None:
+            self._connect(positions)
+        inverse = F(unit / self.tolerance)
+        weight = F(self.weight * unit / (number * self.count))
+        kernel = _many_columns if last - first >= WIDTH else _few_columns
+        with KERNELS:
+            kernel(values, first, last, self.neighbours, self.starts, inverse, weight, gradient)
+
+    def _connect(self, positions: Floats) -> None:
+        number = len(positions)
+        count = min(self.count, number - 1)
+        _, found = cKDTree(positions).query(positions, k=count + 1)
+        own = np.repeat(np.arange(number), count + 1)
+        other = found.ravel()
+        keys = np.concatenate([own * number + other, other * number + own])
+        keys = np.sort(keys[keys // number != keys % number])  # none is its own neighbour
+        keys = keys[np.diff(keys, prepend=-1) > 0]
+        self.neighbours = (keys % number).astype(np.int32)
+        self.starts = np.searchsorted(keys // number, np.arange(number + 1)).astype(np.int32)
+
+    def forget(self) -> None:
+        """Other Gaussians have taken the place of those that were compared."""
+        self.neighbours = None
+
+    def arrays(self) -> Arrays:
+        """The whole state, for a checkpoint."""
+        if self.neighbours is None:
+            return {}
+        return {"variation_neighbours": self.neighbours, "variation_starts": self.starts}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take up what `arrays` gave."""
+        self.neighbours = arrays.get("variation_neighbours")
+        self.starts = arrays.get("variation_starts", self.starts)
