@@ -1,6 +1,6 @@
 """Time of a fit of three 512x384 views, and where the CPU time of an iteration goes.
 
-    python benchmarks/fit.py [--presets dentalsplat dentalsplat+held paper] [--threads 2] [--iterations N]
+    python benchmarks/fit.py [--presets dentalsplat paper] [--threads 2] [--iterations N]
 
 The photographs of `data_samples/three_photos` with their true cameras, and the points that their
 true depth gives: nothing but the fit is timed. Wall time is of an idle machine only; CPU time

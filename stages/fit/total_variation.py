@@ -111,7 +111,7 @@ class TotalVariation:
 
         Args:
             positions: [N, 3]; the graph is that of the positions when it is first asked for.
-            values: [N, D] contiguous, of which columns `first` to `last` - 1 are colours, three each.
+            values: [N, D] contiguous; columns `first` to `last` - 1 are colours, three each.
             gradient: [N, D] contiguous.
             unit: the colour that 1 in these columns is.
         """
