@@ -14,8 +14,8 @@ from numba import njit, prange
 from scipy.spatial import cKDTree
 
 from stages.fit.checkpoint import Arrays
+from stages.splatting.lane_types import WIDTH
 from stages.splatting.lanes import (
-    WIDTH,
     at_least,
     at_most,
     count_up,
@@ -118,15 +118,17 @@ class TotalVariation:
         number = len(values)
         if self.weight == 0 or number <= 1:
             return
-        if self.neighbours is None:
-            self._connect(positions)
+        neighbours = self.neighbours
+        if neighbours is None:
+            neighbours = self.neighbours = self._connect(positions)
         inverse = F(unit / self.tolerance)
         weight = F(self.weight * unit / (number * self.count))
         kernel = _many_columns if last - first >= WIDTH else _few_columns
         with KERNELS:
-            kernel(values, first, last, self.neighbours, self.starts, inverse, weight, gradient)
+            kernel(values, first, last, neighbours, self.starts, inverse, weight, gradient)
 
-    def _connect(self, positions: Floats) -> None:
+    def _connect(self, positions: Floats) -> Integers:
+        """The neighbours; `starts` is set."""
         number = len(positions)
         count = min(self.count, number - 1)
         _, found = cKDTree(positions).query(positions, k=count + 1)
@@ -135,8 +137,8 @@ class TotalVariation:
         keys = np.concatenate([own * number + other, other * number + own])
         keys = np.sort(keys[keys // number != keys % number])  # none is its own neighbour
         keys = keys[np.diff(keys, prepend=-1) > 0]
-        self.neighbours = (keys % number).astype(np.int32)
         self.starts = np.searchsorted(keys // number, np.arange(number + 1)).astype(np.int32)
+        return (keys % number).astype(np.int32)
 
     def forget(self) -> None:
         """Other Gaussians have taken the place of those that were compared."""

@@ -275,7 +275,12 @@ class Trainer:
         add_regularisers(self.packed, gradient, s.opacity_reg, s.scale_reg)
         if self.light is None:
             self.variation.add(
-                self.packed[:, :3], self.packed, HARMONICS, self.packed.shape[1], gradient, C0
+                self.packed[:, :3],
+                self.packed,
+                HARMONICS,
+                self.packed.shape[1],
+                gradient,
+                float(C0),
             )
         if s.isotropic:
             gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)

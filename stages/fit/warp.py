@@ -82,10 +82,9 @@ class Warp:
     def collect(self, by_position: Floats, by_normal: Floats | None) -> None:
         """Add a photograph's gradients [N, 3] by where Gaussians are and what they face."""
         lit = by_normal is not None
+        normal_part = by_position if by_normal is None else by_normal
         with KERNELS:
-            _collect(
-                by_position, by_normal if lit else by_position, lit, self.normals, self.gradient
-            )
+            _collect(by_position, normal_part, lit, self.normals, self.gradient)
         self.collected += 1
 
     def move(self, rate: float) -> Bent | None:
@@ -221,6 +220,7 @@ def turned(quaternions: Floats, first: Floats, second: Floats) -> Floats:
     Between opposite vectors it is one of the half turns; vectors of 0 turn nothing.
     """
     result = np.empty((len(quaternions), 4), np.float32)
+    first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
     with KERNELS:
-        _turned(*(np.asarray(array, np.float32) for array in (quaternions, first, second)), result)
+        _turned(np.asarray(quaternions, np.float32), first, second, result)
     return result

@@ -23,8 +23,8 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from pipeline.artifacts.gaussians import Gaussians, Light
+from stages.splatting.lane_types import WIDTH
 from stages.splatting.lanes import (
-    WIDTH,
     at_least,
     exponential,
     load_from,
