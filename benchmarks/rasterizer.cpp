@@ -14,7 +14,7 @@ namespace {
 
 constexpr int TILE = 32, BLOCK = 4, SIDE = TILE / BLOCK, BLOCKS = SIDE * SIDE;
 constexpr int SCREEN = 16, SLOT = 16;
-constexpr float ALPHA_MAX = 0.99f, TRANSMITTANCE_MIN = 1e-4f, SAFETY = 0.01f;
+constexpr float ALPHA_MAX = 0.999f, TRANSMITTANCE_MIN = 1e-4f, SAFETY = 0.01f;
 constexpr float HALF_LOG2E = 0.5f * 1.4426950408889634f;
 constexpr int NEVER = 2147483647;
 

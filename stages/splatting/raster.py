@@ -57,8 +57,9 @@ Bits = npt.NDArray[np.int64]
 F = np.float32
 I = np.int32
 
-#: largest alpha of one Gaussian, and transmittance below which a pixel is finished (as 3DGS)
-ALPHA_MAX = F(0.99)
+#: largest alpha of one Gaussian (as gsplat; 3DGS has .99), and transmittance below which a pixel is
+#: finished
+ALPHA_MAX = F(0.999)
 TRANSMITTANCE_MIN = F(1e-4)
 NEVER = I(2147483647)
 HALF_LOG2E = F(0.5 * 1.4426950408889634)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 #: as `raster.ALPHA_MAX`, `raster.TRANSMITTANCE_MIN` and `rasterizer.LOW_PASS`, `ALPHA_CUT`
-ALPHA_MAX = 0.99
+ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 LOW_PASS = 0.3
 ALPHA_CUT = 1 / 255
