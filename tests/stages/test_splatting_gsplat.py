@@ -1,4 +1,4 @@
-"""Our rasterizer against gsplat: its own formulas in torch anywhere, its kernels where a card is."""
+"""Our rasterizer against gsplat: its formulas in torch anywhere, its kernels where a card is."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def agree(theirs, ours, sure) -> None:
     """Images to 1e-4, gradients to 1e-3 of the largest."""
     weights = None
     gradients = []
-    for (images, alphas), leaves in (theirs, ours):
+    for (images, _), leaves in (theirs, ours):
         if weights is None:
             generator = torch.Generator().manual_seed(4)
             weights = torch.rand(images.shape, generator=generator) * sure[..., None]
