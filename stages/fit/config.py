@@ -19,9 +19,15 @@ def number(default: Any, description: str, **bounds: Any) -> Any:
 class FitConfig(StageConfig):
     """``auto`` follows the number of placed views; the summary tells what it came to."""
 
+    backend: Literal["auto", "cpu", "gsplat"] = Field(
+        "auto",
+        description="what draws the Gaussians in every step: our kernels on the processor, which "
+        "give the same bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is "
+        "one and it gives the same images and gradients in a first trial)",
+    )
     iterations: Auto | int = number(
         AUTO,
-        "optimiser steps, one view each (auto: 400 at 3 views, 1000 from 6; 600 on a held surface)",
+        "optimiser steps, one view each (auto: 400 at 3 views, 1000 from 6; 500 on a held surface)",
     )
     initial_points: Auto | int = number(
         AUTO,

@@ -15,6 +15,7 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from stages.fit.backend import use_backend
 from stages.fit.floaters import before_lens, contribution
 from stages.fit.initial import Frame
 from stages.fit.lighting import choose_light, harmonics_for_viewers
@@ -22,7 +23,7 @@ from stages.fit.objectives import logit
 from stages.fit.scene import prepare
 from stages.fit.settings import FitSettings
 from stages.fit.trainer import Trainer
-from stages.splatting.rasterizer import unpack, use_threads
+from stages.splatting.rasterizer import rasterize, unpack, use_threads
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -40,6 +41,8 @@ class FitResult:
     surface_held: Gaussians were held to the surface of the points.
     surface_bent: by how much 95 % of the surface has moved at most, as a share of the scene's
         depth; 0 where it was left as it is.
+    backend: ``"cpu"`` or ``"gsplat"``, what was used.
+    backend_note: why a card was not used, if there is one.
     light_figures: PSNR of the held-out photograph in the trials, where there were any.
     """
 
@@ -53,6 +56,8 @@ class FitResult:
     light_figures: dict[str, float]
     surface_held: bool
     surface_bent: float
+    backend: str
+    backend_note: str | None
 
 
 def fit(
@@ -81,6 +86,7 @@ def fit(
 
     Raises:
         ReconstructionError: the fit diverged, or nothing is left of it.
+        RequestError: `backend` can't be had.
     """
     use_threads(threads)
     scene = prepare(views, cameras, points, flow, settings)
@@ -90,6 +96,7 @@ def fit(
         light, figures = choose_light(scene, settings)
     lit = light == "camera"
     trainer = scene.trainer(settings, lit)
+    note = use_backend(trainer)
     trainer.run(checkpoint, report, diary)
     keep = worth_keeping(trainer, scene.cloud.positions)
     if not keep.any():
@@ -127,6 +134,7 @@ def fit(
         before - len(trainer.packed), len(scene.flows), light, figures,
         trainer.held_surface is not None,
         trainer.warp.reach() if trainer.warp is not None else 0.0,
+        "cpu" if trainer.rasterize is rasterize else "gsplat", note,
     )  # fmt: skip
 
 

@@ -116,6 +116,6 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         trainer.extent, colours_only,
     )  # fmt: skip
     second.exposure.values = trainer.exposure.values
-    second.variation = trainer.variation
+    second.variation, second.rasterize = trainer.variation, trainer.rasterize
     second.run(None, lambda *_: None)
     return second

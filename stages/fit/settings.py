@@ -21,6 +21,7 @@ class FitSettings:
     (the light does) and `background` (the masks do) may be.
     """
 
+    backend: str
     iterations: int
     initial_points: int
     trusted_confidence: float

@@ -72,6 +72,8 @@ class FitStage(Stage):
             threads=context.threads, checkpoint=context.scratch / "fit.npz", report=report,
             diary=diary,
         )  # fmt: skip
+        if result.backend_note:
+            context.warn(result.backend_note)
         refined = {camera.name: camera for camera in result.cameras}
         context.save(result.gaussians)
         context.save(
@@ -89,6 +91,7 @@ class FitStage(Stage):
         context.summarize(
             gaussians=len(result.gaussians),
             iterations=settings.iterations,
+            backend=result.backend,
             light=result.light,
             surface_held=str(result.surface_held),
             surface_bent=round(result.surface_bent, 5),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,7 @@ class Trainer:
     Attributes:
         packed: [N, 11 + 3 K] float32 Gaussians.
         poses: the cameras' optimiser, which holds the poses.
+        rasterize: what steps are taken with (see `backend`).
         variation: draws the colours of neighbours together.
         iteration: steps taken.
         psnr, loss: running means over recent iterations.
@@ -88,6 +90,7 @@ class Trainer:
         self.packed = packed
         self.poses = PoseOptimizer(poses, held)
         self.adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
+        self.rasterize: Callable[..., Any] = rasterize
         s = settings
         self.variation = TotalVariation(s.lambda_tv, s.tv_neighbours, s.tv_tolerance)
         self.statistics = DensityStatistics.empty(len(packed))
@@ -181,7 +184,7 @@ class Trainer:
         viewpoint = self.viewpoint(view, target)
         if self.light is not None:
             self.light.shade(self.packed, viewpoint)
-        rendering = rasterize(
+        rendering = self.rasterize(
             self.packed, viewpoint, degree=self.degree(), near=s.near,
             depth=self._with_depth(target), flow_to=following,
         )  # fmt: skip
@@ -200,7 +203,7 @@ class Trainer:
             self.poses.step(view, by_pose, rate)
             if flow is not None:
                 self.poses.step(flow.to, gradients.next_pose, rate)
-        if s.optimize_focal:
+        if s.optimize_focal:  # never on a card
             self.focal.step(gradients.focal, viewpoint.intrinsics, s.focal_lr)
         if s.densify and s.strategy == "default":
             self.statistics.add(

@@ -70,7 +70,7 @@ def test_nothing_of_our_own_is_in_the_paper_and_its_baselines(name: str) -> None
     # the same with any number of views: our own schedule does not reach them
     decided = {key for key, value in fit.items() if value == "auto"}
     light = {"light_albedo_lr", "light_normal_lr", "light_strengths", "light_strength_lr"}
-    assert decided <= light | {"pose_lr_init", "pose_lr_final"}
+    assert decided <= light | {"pose_lr_init", "pose_lr_final", "backend"}
     assert fit["optimize_poses"] is False or not decided & {"pose_lr_init", "pose_lr_final"}
     assert ("flow" in config.run.stages) == (fit["lambda_flow"] > 0)
 

@@ -1,0 +1,101 @@
+"""Which rasterizer a fit uses: the processor's, or gsplat's on a card that first proves itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import RequestError
+from stages.fit.settings import FitSettings
+from stages.splatting.rasterizer import rasterize
+
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+#: the card's image may differ by this much from the processor's (mean over the pixels), and its
+#: gradients by this share: sums in another order do, a wrong convention does by far more
+IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-3, 0.02
+
+
+def has_card() -> bool:
+    """Whether gsplat is installed and there is a card that torch can use."""
+    if shutil.which("nvidia-smi") is None or importlib.util.find_spec("gsplat") is None:
+        return False
+    from stages.splatting.torch_api import choose_backend
+
+    return choose_backend() == "gsplat"
+
+
+def use_backend(trainer: Trainer) -> str | None:
+    """Give a fit that is about to start its rasterizer.
+
+    Returns:
+        Why there is a card that is not used; None if all is as it was asked for.
+
+    Raises:
+        RequestError: gsplat was asked for and can't be used.
+    """
+    s = trainer.settings
+    if s.backend == "cpu" or (s.backend == "auto" and not has_card()):
+        return None
+    why = _obstacle(s) or _disagreement(trainer)
+    if why is None:
+        trainer.rasterize = _card()
+        return None
+    if s.backend == "gsplat":
+        raise RequestError(
+            f"fit.backend=gsplat can't be used: {why}. Take fit.backend=cpu, or auto, which uses a "
+            "card only where it works."
+        )
+    return f"The fit ran on the processor although there is a card: {why}."
+
+
+def _obstacle(s: FitSettings) -> str | None:
+    if s.optimize_focal:
+        return "it gives no gradient by the focal length (fit.optimize_focal)"
+    if s.progressive:
+        return "views that are placed one by one are placed by the processor (fit.progressive)"
+    if not has_card():
+        return "there is no gsplat (install dentalsplat[gpu]) or no card that torch can use"
+    return None
+
+
+def _card() -> Any:
+    from stages.splatting.card import rasterize_on_card
+
+    return rasterize_on_card
+
+
+def _disagreement(trainer: Trainer) -> str | None:
+    """What is different on the card in the first view, or None."""
+    target = trainer.targets[0][1]
+    viewpoint = trainer.viewpoint(0, target)
+    if trainer.light is not None:
+        trainer.light.shade(trainer.packed, viewpoint)
+    last = len(trainer.targets) - 1
+    options: dict[str, Any] = {
+        "degree": trainer.degree(), "near": trainer.settings.near, "depth": True,
+        "flow_to": trainer.viewpoint(last, trainer.targets[last][1]),
+    }  # fmt: skip
+    try:
+        ours = rasterize(trainer.packed, viewpoint, **options)
+        theirs = _card()(trainer.packed, viewpoint, **options)
+        off = float(np.abs(ours.planes[:4] - theirs.planes[:4]).mean())
+        if not off < IMAGE_TOLERANCE:
+            return f"its images differ from the processor's by {off:.2g} on average"
+        pattern = np.random.default_rng(0).normal(size=ours.planes.shape).astype(np.float32)
+        pattern[4:] = 0  # in px, of another size
+        nothing = np.zeros_like(ours.transmittance)
+        wanted, found = ours.backward(pattern, nothing), theirs.backward(pattern, nothing)
+    except Exception as error:  # a driver or compiler that is out of order is no reason to stop
+        return f"it failed ({type(error).__name__}: {error})"
+    for name in ("packed", "pose", "centres", "absolute"):
+        expected, got = getattr(wanted, name), getattr(found, name)
+        size = max(float(np.linalg.norm(expected)), 1e-30)
+        share = float(np.linalg.norm(got - expected)) / size
+        if not share < GRADIENT_TOLERANCE:
+            return f"its gradients ({name}) differ from the processor's by {share:.1%}"
+    return None

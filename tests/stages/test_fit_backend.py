@@ -1,0 +1,100 @@
+"""A fit on a graphics card: the same code with another device, and what happens where it fails."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RequestError
+from stages.fit import backend
+from stages.fit.stage import FitStage
+from stages.splatting.card import rasterize_on_card
+from stages.splatting.rasterizer import Viewpoint, rasterize
+from tests.stages.test_fit_light import case, context
+
+#: what runs on a card, with torch on the processor and our kernels in gsplat's place
+STAND_IN = partial(rasterize_on_card, device="cpu", backend="cpu")
+
+
+@pytest.mark.parametrize(("degree", "depth", "flow"), [(0, False, False), (2, True, True)])
+def test_the_card_is_handed_the_same_scene(degree: int, depth: bool, flow: bool) -> None:
+    random = np.random.default_rng(0)
+    count, terms = 200, (degree + 1) ** 2
+    packed = np.concatenate(
+        [random.uniform(-1, 1, (count, 2)), random.uniform(1, 3, (count, 1)),
+         random.normal(size=(count, 4)), np.log(random.uniform(0.02, 0.2, (count, 3))),
+         random.normal(size=(count, 1 + 3 * terms))], 1,
+    ).astype(np.float32)  # fmt: skip
+    intrinsics = np.float32([60, 58, 31, 25])
+    here, there = np.eye(4, dtype=np.float32)[:3].copy(), np.eye(4, dtype=np.float32)[:3].copy()
+    there[0, 3] = 0.05
+    view, following = (Viewpoint(pose, intrinsics, 64, 48) for pose in (here, there))
+    options = {
+        "degree": degree,
+        "near": 0.2,
+        "depth": depth,
+        "flow_to": following if flow else None,
+    }
+    ours = rasterize(packed, view, **options)
+    theirs = STAND_IN(packed, view, **options)
+    assert np.abs(ours.planes[: len(theirs.planes)] - theirs.planes).max() < 1e-4
+    assert np.abs(ours.transmittance - theirs.transmittance).max() < 1e-5
+    assert (ours.visible == theirs.visible).all()
+    by_image = random.normal(size=theirs.planes.shape).astype(np.float32)
+    by_transmittance = random.normal(size=ours.transmittance.shape).astype(np.float32)
+    wanted = ours.backward(by_image, by_transmittance)
+    found = theirs.backward(by_image, by_transmittance)
+    for name in ("packed", "pose", "next_pose", "centres", "absolute"):
+        expected, got = getattr(wanted, name), getattr(found, name)
+        assert np.abs(expected - got).max() <= 1e-4 * np.abs(expected).max(), name
+
+
+def fitted(tmp_path, **config):
+    views, cameras, points, _ = case(lit=True)
+    here = context(tmp_path, views, cameras, points, light="camera", iterations=30, **config)
+    FitStage().run(here)
+    return here
+
+
+def test_a_card_that_agrees_is_used(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = fitted(tmp_path / "cpu", densify=True, densify_from_iter=10)
+    assert plain.figures["backend"] == "cpu"
+    monkeypatch.setattr(backend, "has_card", lambda: True)
+    monkeypatch.setattr(backend, "_card", lambda: STAND_IN)
+    card = fitted(tmp_path / "card", densify=True, densify_from_iter=10)
+    assert card.figures["backend"] == "gsplat"
+    assert card.figures["train_psnr"] == pytest.approx(plain.figures["train_psnr"], abs=0.1)
+
+
+def wrong_way_round(*arguments, **options):
+    rendering = STAND_IN(*arguments, **options)
+    rendering.planes[:] = rendering.planes[:, ::-1].copy()
+    return rendering
+
+
+def out_of_order(*arguments, **options):
+    raise RuntimeError("no kernel image is available")
+
+
+@pytest.mark.parametrize(
+    ("card", "word"), [(wrong_way_round, "images differ"), (out_of_order, "no kernel image")]
+)
+def test_a_card_that_does_not_is_not(tmp_path, monkeypatch, card, word: str) -> None:
+    monkeypatch.setattr(backend, "has_card", lambda: True)
+    monkeypatch.setattr(backend, "_card", lambda: card)
+    automatic = fitted(tmp_path / "auto")
+    assert automatic.figures["backend"] == "cpu"
+    assert any(word in warning for warning in automatic.warnings)
+    with pytest.raises(RequestError, match=word):
+        fitted(tmp_path / "asked", backend="gsplat")
+
+
+def test_a_card_that_is_not_there_is_explained(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(backend, "has_card", lambda: False)
+    with pytest.raises(RequestError, match="no gsplat"):
+        fitted(tmp_path, backend="gsplat")
+    monkeypatch.setattr(backend, "has_card", lambda: True)
+    with pytest.raises(RequestError, match="focal"):
+        fitted(tmp_path, backend="gsplat", optimize_focal=True)
