@@ -24,12 +24,12 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from stages.init.dental.anatomy import teeth_of
-from stages.init.dental.arch_options import ArchOptions
+from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.observation import Dentition
 from stages.init.dental.photo import PhotoOptions
 from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
 from stages.init.dental.solution import PlacedView
-from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface.options import SurfaceOptions
 
 Array = npt.NDArray[np.float64]
 

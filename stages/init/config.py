@@ -9,8 +9,8 @@ from pydantic import Field, field_validator
 
 from pipeline.stage import StageConfig, runtime
 from stages.init.dense.options import DenseOptions
-from stages.init.dental.arch_options import ArchOptions
-from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.options import RefinementOptions
 from stages.init.pointmap.options import PointmapOptions
 

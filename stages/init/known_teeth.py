@@ -19,10 +19,10 @@ from stages.init import cloud
 from stages.init.config import InitConfig
 from stages.init.dense import DenseOptions, DenseView
 from stages.init.dense.reconstruct import complete_depths
-from stages.init.dental.centred import CentredView, centre_view
+from stages.init.dental.cameras.centred import CentredView, centre_view
 from stages.init.dental.photo import PhotoOptions
 from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
-from stages.init.dental.surface_options import SweepRound
+from stages.init.dental.surface.options import SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement
 from stages.init.teeth import arch_options, masked, neighbours, surface_options, tooth_counts

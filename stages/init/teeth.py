@@ -17,11 +17,11 @@ from pipeline.stage import StageContext
 from stages.init import cloud
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.anatomy import LOWER_TEETH, UPPER_TEETH
-from stages.init.dental.arch_options import ArchOptions, ToothHint
+from stages.init.dental.numbering.arch_options import ArchOptions, ToothHint
 from stages.init.dental.photo import PhotoOptions
 from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
-from stages.init.dental.surface_options import SurfaceOptions
+from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.geometry import Pair
 from stages.init.place import photo_name, with_focals
 from stages.init.placement import Placement

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RequestError
-from stages.init.dental import bundle_kernels as kernels
-from stages.init.dental.arch import ArchOptions, ToothHint, fit_arch
-from stages.init.dental.bundle import nominal_rotation
+from stages.init.dental.cameras import kernels
+from stages.init.dental.cameras.bundle import nominal_rotation
+from stages.init.dental.numbering.arch import ArchOptions, ToothHint, fit_arch
+from stages.init.dental.numbering.sightings import JAWS, upright
 from stages.init.dental.observation import Crown, Dentition
-from stages.init.dental.sightings import JAWS, upright
 from stages.init.dental.template import (
     EMBRASURE,
     PAPILLA,

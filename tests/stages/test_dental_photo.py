@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stages.init.dental.occlusal import cheapest_path
-from stages.init.dental.overlay import labelled_overlay, sheet
 from stages.init.dental.photo import read_dentitions, row_tilt, teeth_likely
+from stages.init.dental.pictures.overlay import labelled_overlay, sheet
 from stages.init.dental.teeth_mask import HISTOGRAM_BLUR, valleys
 
 HEIGHT, WIDTH = 384, 512

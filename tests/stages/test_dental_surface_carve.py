@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stages.init.dental import surface_grow
-from stages.init.dental.chart import ChartGrid, normals_of
-from stages.init.dental.surface_carve import carved, in_void
-from stages.init.dental.surface_fit import fit_offsets
-from stages.init.dental.surface_grow import best_bend
-from stages.init.dental.surface_photo import find_void
+from stages.init.dental.surface.carve import carved, in_void
+from stages.init.dental.surface.chart import ChartGrid, normals_of
+from stages.init.dental.surface.dense import grow as surface_grow
+from stages.init.dental.surface.fit import fit_offsets
+from stages.init.dental.surface.grow import best_bend
+from stages.init.dental.surface.photo import find_void
 from tests.stages.test_dental_surface_parts import photo
 
 OFFSETS = (np.arange(-20, 21) * 0.25).astype(np.float32)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from stages.init.dental.anatomy import Landmark
-from stages.init.dental.chart import (
+from stages.init.dental.observation import Dentition
+from stages.init.dental.solution import ArchFit, PlacedView
+from stages.init.dental.surface.chart import (
     AXIS_DEPTH,
     ChartGrid,
     faces_of,
@@ -14,16 +16,14 @@ from stages.init.dental.chart import (
     normals_of,
     unroll,
 )
-from stages.init.dental.crown_shape import crown_points, crown_radius, jaw_shape
-from stages.init.dental.observation import Dentition
-from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.surface_charts import teeth_present
-from stages.init.dental.surface_colour import even_rim, find_gains, hidden_edges, spread_colour
-from stages.init.dental.surface_fit import fit_offsets
-from stages.init.dental.surface_options import SurfaceOptions
-from stages.init.dental.surface_photo import Photo, find_gum
-from stages.init.dental.surface_raster import raster_chart, sees
-from stages.init.dental.surface_sweep import choose_pairs, matching_cost
+from stages.init.dental.surface.charts import teeth_present
+from stages.init.dental.surface.colour import even_rim, find_gains, hidden_edges, spread_colour
+from stages.init.dental.surface.crown_shape import crown_points, crown_radius, jaw_shape
+from stages.init.dental.surface.fit import fit_offsets
+from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photo import Photo, find_gum
+from stages.init.dental.surface.raster import raster_chart, sees
+from stages.init.dental.surface.sweep import choose_pairs, matching_cost
 
 GRID = ChartGrid(left=-20.0, top=5.0, density=4.0, shape=(41, 161))
 

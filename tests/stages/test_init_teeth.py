@@ -15,7 +15,7 @@ from stages.init.dental.anatomy import Landmark
 from stages.init.dental.reconstruct import Teeth
 from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.surface import ArchSurface, SurfaceView
+from stages.init.dental.surface.dense import ArchSurface, SurfaceView
 from stages.init.stage import InitStage
 
 SIZE = (96, 128)

@@ -10,15 +10,15 @@ import numpy.typing as npt
 
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
-from stages.init.dental.arch import fit_arch
-from stages.init.dental.arch_options import ArchOptions
+from stages.init.dental.numbering.arch import fit_arch
+from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.observation import Dentition
-from stages.init.dental.overlay import labelled_overlay, sheet
 from stages.init.dental.photo import PhotoOptions, read_dentitions
+from stages.init.dental.pictures.overlay import labelled_overlay, sheet
+from stages.init.dental.pictures.turned import turned_sheet
 from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface import ArchSurface, dense_surface
-from stages.init.dental.surface_options import SurfaceOptions
-from stages.init.dental.turned import turned_sheet
+from stages.init.dental.surface.dense import ArchSurface, dense_surface
+from stages.init.dental.surface.options import SurfaceOptions
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental.anatomy import is_upper
-from stages.init.dental.arch_options import ArchOptions
-from stages.init.dental.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
-from stages.init.dental.bundle_held import HeldCameras
-from stages.init.dental.bundle_kernels import PER_ARCH, PER_VIEW
-from stages.init.dental.sightings import NO_TOOTH, Labels, SeenRow, SightingCache
+from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
+from stages.init.dental.cameras.held import HeldCameras
+from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
+from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.numbering.sightings import NO_TOOTH, Labels, SeenRow, SightingCache
 from stages.init.dental.template import POSITIONS, position_of, textbook_arch
 
 Array = npt.NDArray[np.float64]

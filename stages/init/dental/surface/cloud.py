@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.chart import ChartGrid, faces_of
-from stages.init.dental.crown_shape import beyond_crowns, within_crowns
-from stages.init.dental.surface_charts import (
+from stages.init.dental.surface.chart import ChartGrid, faces_of
+from stages.init.dental.surface.charts import (
     HIDDEN,
     PAST_EDGE,
     Chart,
@@ -18,7 +17,7 @@ from stages.init.dental.surface_charts import (
     nearest_depths,
     smooth_normals,
 )
-from stages.init.dental.surface_colour import (
+from stages.init.dental.surface.colour import (
     Showing,
     blend,
     even_rim,
@@ -29,9 +28,10 @@ from stages.init.dental.surface_colour import (
     show,
     spread_colour,
 )
-from stages.init.dental.surface_options import SurfaceOptions
-from stages.init.dental.surface_photo import Photo
-from stages.init.dental.surface_raster import raster_chart, sees
+from stages.init.dental.surface.crown_shape import beyond_crowns, within_crowns
+from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.raster import raster_chart, sees
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental.anatomy import Jaw
-from stages.init.dental.bundle import Sightings
+from stages.init.dental.cameras.bundle import Sightings
 from stages.init.dental.observation import Dentition, Point
 from stages.init.dental.template import (
     EMBRASURE,

@@ -16,12 +16,13 @@ import numpy.typing as npt
 
 from pipeline.errors import RequestError
 from stages.init.dental.anatomy import Landmark, is_upper
-from stages.init.dental.arch_options import ArchOptions, ToothHint
-from stages.init.dental.bundle import view_angles
-from stages.init.dental.bundle_held import held_cameras, roll_matrix
-from stages.init.dental.confidence import crown_doubts, fit_doubts, landmark_errors
-from stages.init.dental.edits import MIN_GAIN, Fixed, improve, margins, solve_shifted
-from stages.init.dental.hypotheses import (
+from stages.init.dental.cameras.bundle import view_angles
+from stages.init.dental.cameras.held import held_cameras, roll_matrix
+from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo
+from stages.init.dental.numbering.arch_options import ArchOptions, ToothHint
+from stages.init.dental.numbering.confidence import crown_doubts, fit_doubts, landmark_errors
+from stages.init.dental.numbering.edits import MIN_GAIN, Fixed, improve, margins, solve_shifted
+from stages.init.dental.numbering.hypotheses import (
     MAIN_ROLES,
     Scored,
     Scorer,
@@ -29,11 +30,10 @@ from stages.init.dental.hypotheses import (
     search,
     view_candidates,
 )
+from stages.init.dental.numbering.sightings import JAWS, NO_TOOTH, Labels, seen_rows
 from stages.init.dental.observation import Dentition
-from stages.init.dental.sightings import JAWS, NO_TOOTH, Labels, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
-from stages.init.dental.unrolled import PairFigures, dense_matches, prepare_photo
 
 __all__ = ["ArchOptions", "ToothHint", "fit_arch"]
 

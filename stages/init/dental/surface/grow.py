@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from stages.init.dental.chart import ChartGrid
-from stages.init.dental.crown_shape import beyond_crowns
-from stages.init.dental.surface_charts import PAST_EDGE, Chart, comparable, nearest_depths
-from stages.init.dental.surface_options import SurfaceOptions
-from stages.init.dental.surface_photo import Photo
-from stages.init.dental.surface_sweep import match, sweep
+from stages.init.dental.surface.chart import ChartGrid
+from stages.init.dental.surface.charts import PAST_EDGE, Chart, comparable, nearest_depths
+from stages.init.dental.surface.crown_shape import beyond_crowns
+from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.sweep import match, sweep
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

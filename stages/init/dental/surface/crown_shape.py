@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.interpolate import RBFInterpolator
 
 from stages.init.dental.anatomy import Jaw, Landmark, teeth_of
-from stages.init.dental.chart import AXIS_DEPTH, ChartGrid, unroll
+from stages.init.dental.surface.chart import AXIS_DEPTH, ChartGrid, unroll
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from stages.init.dental.bundle_algebra import (
+from stages.init.dental.cameras.algebra import (
     cholesky,
     eliminate,
     rotation_and_jacobian,
     solve_cholesky,
 )
-from stages.init.dental.bundle_kernels import (
+from stages.init.dental.cameras.kernels import (
     CENTRE_UNIT,
     PER_ARCH,
     PER_VIEW,

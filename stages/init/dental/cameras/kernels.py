@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.init.dental.bundle_algebra import (
+from stages.init.dental.cameras.algebra import (
     cholesky,
     cross_matrix,
     eliminate,

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from stages.init.dental.surface import ArchSurface
+from stages.init.dental.surface.dense import ArchSurface
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

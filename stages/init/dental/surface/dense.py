@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from stages.init.dental.anatomy import Jaw
 from stages.init.dental.observation import Dentition
 from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface_charts import (
+from stages.init.dental.surface.charts import (
     PAST_EDGE,
     Chart,
     comparable,
@@ -27,12 +27,12 @@ from stages.init.dental.surface_charts import (
     smooth_normals,
     start_chart,
 )
-from stages.init.dental.surface_cloud import coloured_cloud
-from stages.init.dental.surface_grow import grow_gum
-from stages.init.dental.surface_options import SurfaceOptions, SweepRound
-from stages.init.dental.surface_photo import Photo, prepare_photo
-from stages.init.dental.surface_raster import raster_chart
-from stages.init.dental.surface_sweep import choose_pairs, sweep
+from stages.init.dental.surface.cloud import coloured_cloud
+from stages.init.dental.surface.grow import grow_gum
+from stages.init.dental.surface.options import SurfaceOptions, SweepRound
+from stages.init.dental.surface.photo import Photo, prepare_photo
+from stages.init.dental.surface.raster import raster_chart
+from stages.init.dental.surface.sweep import choose_pairs, sweep
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]

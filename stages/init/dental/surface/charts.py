@@ -10,18 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental.anatomy import Jaw, is_upper, teeth_of
-from stages.init.dental.chart import ChartGrid, grid_around, normals_of
-from stages.init.dental.crown_shape import (
+from stages.init.dental.solution import ArchFit
+from stages.init.dental.surface.chart import ChartGrid, grid_around, normals_of
+from stages.init.dental.surface.crown_shape import (
     JawShape,
     beyond_crowns,
     crown_points,
     crown_radius,
     jaw_shape,
 )
-from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface_options import SurfaceOptions
-from stages.init.dental.surface_photo import Photo
-from stages.init.dental.surface_raster import nearest_of, raster_chart, sees
+from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.raster import nearest_of, raster_chart, sees
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from stages.init.dental.anatomy import is_upper
-from stages.init.dental.bundle import Adjusted, Matches
+from stages.init.dental.cameras.bundle import Adjusted, Matches
 from stages.init.dental.template import landmark_names
 
 Array = npt.NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from stages.init.dental.anatomy import Jaw
-from stages.init.dental.surface_photo import Photo
+from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

@@ -19,8 +19,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental import bundle_kernels as kernels
-from stages.init.dental.bundle_held import (
+from stages.init.dental.cameras import kernels
+from stages.init.dental.cameras.held import (
     PER_SIMILARITY,
     HeldCameras,
     minimise_held,

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental.anatomy import is_upper
-from stages.init.dental.bundle import Adjusted, adjust, view_angles
-from stages.init.dental.bundle_kernels import PER_ARCH, PER_VIEW
-from stages.init.dental.hypotheses import (
+from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
+from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
+from stages.init.dental.numbering.hypotheses import (
     FINAL_STEPS,
     SEARCH_STEPS,
     Labelling,
@@ -22,7 +22,7 @@ from stages.init.dental.hypotheses import (
     contiguous,
     row_defects,
 )
-from stages.init.dental.sightings import JAWS, NO_TOOTH, Labels
+from stages.init.dental.numbering.sightings import JAWS, NO_TOOTH, Labels
 from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
 Array = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Where the cameras are: bundle adjustment with an arch of teeth as the landmarks."""

@@ -1,0 +1,1 @@
+"""Which tooth is which: labellings compared by their evidence."""

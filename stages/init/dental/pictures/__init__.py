@@ -1,0 +1,1 @@
+"""What is drawn of the teeth for people to check."""

@@ -1,0 +1,1 @@
+"""The dense surface of teeth and gum, on one chart per jaw."""

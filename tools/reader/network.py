@@ -1,0 +1,81 @@
+"""The tooth reader's network, in torch: a small residual U-Net with several heads.
+
+It sees a photograph brought to `WIDTH` x `HEIGHT` and answers at half that size. What ships is the
+same network with its normalisation folded in, written by `export.py` and run by OpenCV.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+WIDTH, HEIGHT = 448, 320
+#: The answer's channels, in order. Positions run from the central incisor (1) to the third molar.
+TOOTH, INSIDE, CENTRE, JAW, SIDE, PRIMARY, POSITION = 0, 1, slice(2, 4), 4, 5, 6, slice(7, 15)
+CHANNELS = 15
+#: What kind of photograph it is, and (last) whether the jaws are apart.
+VIEWS = ("front", "right", "left", "upper", "lower", "other")
+#: Pixels of the answer in which offsets to the crown's centre are counted.
+CENTRE_UNIT = 16.0
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions, and the input added."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = convolution(width, width)
+        self.second = nn.Sequential(
+            nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.second(self.first(x)))
+
+
+def convolution(before: int, after: int, stride: int = 1, size: int = 3) -> nn.Sequential:
+    """Convolution, normalisation, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(before, after, size, stride, size // 2, bias=False),
+        nn.BatchNorm2d(after),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Reader(nn.Module):
+    """[N, 3, HEIGHT, WIDTH] normalised RGB -> ([N, 15, HEIGHT/2, WIDTH/2], [N, 7])."""
+
+    def __init__(self, widths: tuple[int, ...] = (16, 32, 64, 128, 160)) -> None:
+        super().__init__()
+        a, b, c, d, e = widths
+        self.stem = nn.Sequential(convolution(3, a, 2, 5), convolution(a, a))
+        self.down = nn.ModuleList(
+            [
+                nn.Sequential(convolution(a, b, 2), Residual(b)),
+                nn.Sequential(convolution(b, c, 2), Residual(c)),
+                nn.Sequential(convolution(c, d, 2), Residual(d), Residual(d)),
+                nn.Sequential(convolution(d, e, 2), Residual(e), nn.Dropout2d(0.1)),
+            ]
+        )
+        self.context = nn.Conv2d(e, e, 1)
+        self.narrow = nn.ModuleList(
+            [nn.Conv2d(x, y, 1) for x, y in ((e, d), (d, c), (c, b), (b, a))]
+        )
+        self.up = nn.ModuleList([Residual(width) for width in (d, c, b, a)])
+        self.heads = nn.Sequential(convolution(a, 32), nn.Conv2d(32, CHANNELS, 1))
+        self.kind = nn.Conv2d(e, len(VIEWS) + 1, 1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        levels = [self.stem(x)]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        y = levels.pop()
+        whole = F.adaptive_avg_pool2d(y, 1)
+        kind = self.kind(whole).flatten(1)
+        y = y + F.relu(self.context(whole))
+        for narrow, up in zip(self.narrow, self.up, strict=True):
+            skip = levels.pop()
+            y = F.interpolate(narrow(y), scale_factor=2, mode="bilinear", align_corners=False)
+            y = up(y + skip)
+        return self.heads(y), kind

@@ -1,0 +1,135 @@
+"""What the reader learns from: labelled photographs, and mouths of our own generator."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+#: FDI number -> that of the tooth in the same place on the other side.
+MIRRORED = np.arange(256, dtype=np.uint8)
+for _tooth in range(11, 90):
+    _quadrant, _place = divmod(_tooth, 10)
+    if 1 <= _quadrant <= 8:
+        MIRRORED[_tooth] = 10 * (_quadrant + 1 if _quadrant % 2 else _quadrant - 1) + _place
+#: A crown whose number nobody knows.
+UNNUMBERED = 255
+#: Pictures smaller than this show nothing.
+LEAST_SIDE = 60
+#: Long side to which pictures are brought.
+LONG_SIDE = 720
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A labelled photograph.
+
+    Attributes:
+        name: where it is from.
+        image: [H, W, 3] uint8 RGB.
+        crowns: [H, W] uint8, one number per crown, 0: no tooth.
+        teeth: [H, W] uint8 FDI numbers; `UNNUMBERED` where not known, 0: no tooth.
+        inside: [H, W] uint8: distance to the crown's own border, 255 at its middle.
+        view: index into `network.VIEWS`, -1: unknown.
+        bite: 0 closed, 1 open, -1 unknown.
+    """
+
+    name: str
+    image: npt.NDArray[np.uint8]
+    crowns: npt.NDArray[np.uint8]
+    teeth: npt.NDArray[np.uint8]
+    inside: npt.NDArray[np.uint8]
+    view: int
+    bite: int
+
+
+def distance_inside(crowns: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """[H, W] distance of each pixel to the border of its own crown, 255 at the crown's middle.
+
+    Args:
+        crowns: [H, W] one number per crown, 0: none.
+    """
+    result = np.zeros(crowns.shape, np.uint8)
+    for number in np.unique(crowns):
+        if number == 0:
+            continue
+        x, y, w, h = cv2.boundingRect((crowns == number).astype(np.uint8))
+        part = (crowns[y : y + h, x : x + w] == number).astype(np.uint8)
+        depth = cv2.distanceTransform(cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT),
+                                      cv2.DIST_L2, 5)[1:-1, 1:-1]  # fmt: skip
+        whole = result[y : y + h, x : x + w]
+        np.maximum(whole, (255 * depth / max(float(depth.max()), 1e-6)).astype(np.uint8), out=whole)
+    return result
+
+
+def _sample(
+    name: str, image: npt.NDArray[np.uint8], crowns: npt.NDArray[np.uint8],
+    teeth: npt.NDArray[np.uint8], view: int, bite: int,
+) -> Sample:  # fmt: skip
+    scale = LONG_SIDE / max(image.shape[:2])
+    if scale < 1:
+        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        crowns = cv2.resize(crowns, size, interpolation=cv2.INTER_NEAREST)
+        teeth = cv2.resize(teeth, size, interpolation=cv2.INTER_NEAREST)
+    return Sample(name, image, crowns, teeth, distance_inside(crowns), view, bite)
+
+
+def read_labelled(
+    folder: Path, split: str, views: tuple[str, ...], extra: Path | None = None
+) -> list[Sample]:
+    """The photographs of `split` with an outline per tooth, and numbers where they are known.
+
+    Args:
+        folder: of the data set: `train/`, `valid/`, `fdi.json`.
+        split: `train` or `valid`.
+        views: names of the kinds of photographs.
+        extra: further numbers in the form of `fdi.json`.
+    """
+    known = json.loads((folder / "fdi.json").read_text())
+    if extra is not None:
+        known = {**json.loads(extra.read_text()), **known}
+    samples = []
+    for path in sorted((folder / split).glob("*.png")):
+        image = cv2.imread(str(path.with_suffix(".jpg")))
+        crowns = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None or min(image.shape[:2]) < LEAST_SIDE:
+            continue
+        label = known.get(f"{split}/{path.stem}", {})
+        numbers = np.full(256, UNNUMBERED, np.uint8)
+        numbers[0] = 0
+        for crown, tooth in label.get("fdi", {}).items():
+            if int(crown) not in label.get("unsure", []):
+                numbers[int(crown)] = tooth
+        view = label.get("view", "")
+        if view == "occlusal":
+            quadrants = {int(tooth) // 10 for tooth in label["fdi"].values()}
+            view = "upper" if quadrants <= {1, 2, 5, 6} else "lower"
+        bite = {"closed": 0, "open": 1}.get(label.get("bite", ""), -1)
+        samples.append(
+            _sample(
+                f"{split}/{path.stem}", np.ascontiguousarray(image[..., ::-1]), crowns,
+                numbers[crowns], views.index(view) if view in views else -1, bite,
+            )
+        )  # fmt: skip
+    return samples
+
+
+def read_generated(folder: Path, views: tuple[str, ...]) -> list[Sample]:
+    """Photographs of generated mouths (`data_samples/mouths`): every number is known."""
+    index = json.loads((folder / "index.json").read_text())
+    samples = []
+    for name, entry in sorted(index.items()):
+        image = cv2.imread(str(folder / f"{name}.jpg"))
+        teeth = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        samples.append(
+            _sample(
+                name, np.ascontiguousarray(image[..., ::-1]), teeth, teeth,
+                views.index(entry["view"]), {"closed": 0, "open": 1}[entry["bite"]],
+            )
+        )  # fmt: skip
+    return samples
