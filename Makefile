@@ -2,9 +2,11 @@
 # Ubuntu have packages for.
 
 PYTHON ?= python3
+MOUTHS ?= 900
+STEPS ?= 6000
 BIN := .venv/bin
 
-.PHONY: demo test lint bench system chromium clean
+.PHONY: demo test lint bench reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -19,6 +21,15 @@ lint: .venv/installed-dev
 
 bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+# The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: hours.
+reader: .venv/installed-dev
+	@test -d "$(DATA)" || { echo "make reader DATA=FOLDER: a folder with train/, valid/, fdi.json"; exit 2; }
+	$(BIN)/python data_samples/mouths/__main__.py --count $(MOUTHS) --seed 1 --out runs/mouths
+	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
+	    --mouths runs/mouths --steps $(STEPS) --out runs/reader.pt
+	$(BIN)/python tools/reader/export.py runs/reader.pt stages/teeth/reader.onnx
+	$(BIN)/python tools/reader/score.py --data "$(DATA)"
 
 # Shared libraries that Python wheels expect from the system, and the module that makes environments.
 system:

@@ -21,15 +21,16 @@ import open3d
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.fdi import teeth_of
+from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
-from stages.init.dental.anatomy import teeth_of
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.observation import Dentition
-from stages.init.dental.photo import PhotoOptions
-from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
+from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.solution import PlacedView
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.teeth.choose import ChoiceOptions, choose
+from stages.teeth.reader import read_photographs
 
 Array = npt.NDArray[np.float64]
 
@@ -128,7 +129,15 @@ def read_case(data: Path, names: str) -> Case:
     return Case(names, views, cameras)
 
 
-def count_labels(case: Case, scan: Scan, teeth: Teeth) -> tuple[int, int, int]:
+def read_teeth(case: Case, threads: int) -> list[Dentition | None]:
+    """The crowns of each photograph as the stage `teeth` reads them; None: it is set aside."""
+    readings = read_photographs(case.views, threads, lambda *_: None)
+    images = [view.image for view in case.views]
+    chosen = choose(readings, images, case.name.split(","), ChoiceOptions())
+    return [None if d.set_aside or not d.all_crowns else d for d in chosen]
+
+
+def count_labels(case: Case, scan: Scan, teeth: Reconstruction) -> tuple[int, int, int]:
     """Crowns labelled right, wrong, and left without a number. Those at the row's ends are out."""
     right = wrong = none = 0
     for camera, dentition, placed in zip(
@@ -171,7 +180,7 @@ def rotation_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> Array:
     return np.degrees([Rotation.from_matrix(matrix).magnitude() for matrix in relative])
 
 
-def epipolar_errors(case: Case, teeth: Teeth) -> tuple[float, float]:
+def epipolar_errors(case: Case, teeth: Reconstruction) -> tuple[float, float]:
     """Median Sampson distance in pixels of landmarks seen in two neighbouring photographs, under
     the cameras found and under the true (or reference) ones."""
     seen = [
@@ -217,7 +226,9 @@ def _sampson(first: Camera, second: Camera, one: Array, other: Array) -> Array:
     return np.abs((lines * other).sum(1)) / slope
 
 
-def surface_scores(case: Case, scan: Scan, teeth: Teeth) -> tuple[float, float, float, float]:
+def surface_scores(
+    case: Case, scan: Scan, teeth: Reconstruction
+) -> tuple[float, float, float, float]:
     """Median and 90 % of the distance of tooth depths to the scan after similarity and ICP, mm;
     share within 1 mm; share of the tooth pixels that have depth."""
     found, truth, covered, shown = [], [], 0, 0
@@ -300,8 +311,8 @@ def main() -> None:
         cpu, wall = time.process_time(), time.perf_counter()
         try:
             teeth = reconstruct_teeth(
-                case.views, names.split(","), [None] * len(case.views), PhotoOptions(),
-                ArchOptions(), SurfaceOptions(), accept_doubtful=False, seed=0,
+                case.views, names.split(","), read_teeth(case, options.threads),
+                [None] * len(case.views), ArchOptions(), SurfaceOptions(), accept_doubtful=False,
                 threads=options.threads, progress=lambda *_: None,
             )  # fmt: skip
         except ReconstructionError as error:

@@ -28,13 +28,21 @@ class ReconstructionError(PipelineError):
     Attributes:
         pictures: name -> [H, W, 3] uint8 image that shows what is wrong. The runner keeps them in
             the workspace and tells the user where.
+        artifacts: kind -> artifact (`pipeline.artifacts`) that was made before it turned out not to
+            be safe. The runner keeps them beside the pictures, for the page to put them right.
     """
 
     exit_status = 3
 
-    def __init__(self, message: str, pictures: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        pictures: Mapping[str, Any] | None = None,
+        artifacts: Mapping[str, Any] | None = None,
+    ) -> None:
         super().__init__(message)
         self.pictures = dict(pictures or {})
+        self.artifacts = dict(artifacts or {})
 
 
 class StageError(PipelineError):

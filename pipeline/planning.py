@@ -101,7 +101,8 @@ def resolve_chain(
         names = names[names.index(from_stage) :]
     usable = usable_stages()
     readers = tuple(name for name in order if name in usable and usable[name].uses_sources)
-    implicit = tuple(name for name in readers if name not in names)
+    prepare = tuple(name for name in order if name in usable and usable[name].prepares)
+    implicit = tuple(n for n in order if n in readers + prepare and n not in names)
     if images_named:
         names = (*implicit, *names)
     elif not stages and not from_stage:
@@ -204,7 +205,8 @@ def plan_stage(
     if waiting:
         state = "pending" if pointer else "missing"
         return PlannedStage(name, state, inputs, [f"depends on {' and '.join(waiting)}"])
-    sources = stage.sources(config.sections[name], {"images": list(images)})
+    request = {"images": list(images), "workspace": store.root}
+    sources = stage.sources(config.sections[name], request)
     hashes = {label: _hash_source(label, path) for label, path in sources.items()}
     material = key_material(stage, config, inputs, hashes)
     key = key_of(material)

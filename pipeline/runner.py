@@ -53,6 +53,7 @@ class RunSummary:
     stages: list[StageOutcome] = field(default_factory=list)
     results: Path | None = None
     report: Path | None = None
+    check: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON values."""
@@ -60,6 +61,7 @@ class RunSummary:
             "workspace": str(self.workspace),
             "results": str(self.results) if self.results else None,
             "report": str(self.report) if self.report else None,
+            "check": str(self.check) if self.check else None,
             "stages": [
                 {**vars(s), "folder": str(s.folder) if s.folder else None} for s in self.stages
             ],
@@ -187,11 +189,15 @@ class Runner:
             self._check_upstream()
             summary = self._run_all(force)
             summary.report = self._write_report()
+            summary.check = self._check_page() if summary.report else None
             return summary
-        except (ReconstructionError, StageError):
+        except (ReconstructionError, StageError) as error:
             report = self._write_report()
             if report is not None:
                 self.reporter.message(f"What came of it so far: {report}")
+            page = self._check_page() if report else None
+            if page and isinstance(error, ReconstructionError) and error.artifacts:
+                error.args = (f"{error} To put it right, open {page} in a browser.",)
             raise
         finally:
             self.reporter.stop()
@@ -207,6 +213,13 @@ class Runner:
         except Exception as error:
             self.reporter.message(f"The report could not be written: {error}")
             return None
+
+    def _check_page(self) -> Path | None:
+        """The page to put the teeth right, where the report wrote one."""
+        from pipeline.report import CHECK
+
+        page = self.request.workspace / CHECK
+        return page if page.is_file() else None
 
     def _dry_run(self, force: bool) -> RunSummary:
         summary = RunSummary(self.request.workspace)
@@ -358,9 +371,10 @@ class Runner:
                 "is kept. Run again with --debug for the whole trace, and please report it."
             )
         self.store.discard_outputs(name, key)
-        if isinstance(failure, ReconstructionError) and failure.pictures:
-            folder = self.store.keep_pictures(name, failure.pictures)
-            failure.args = (f"{failure} Pictures that show it: {folder}",)
+        if isinstance(failure, ReconstructionError):
+            folder = self.store.keep_evidence(name, failure.pictures, failure.artifacts)
+            if failure.pictures:
+                failure.args = (f"{failure} Pictures that show it: {folder}",)
         self.store.record_failure(name, key, str(failure))
         return failure
 

@@ -99,6 +99,8 @@ class Stage(ABC):
         libraries: distributions whose versions can change the result, so that they enter the key.
         methods: value of the config field `method` -> one line about it, where there is a choice.
         uses_sources: True for a stage that reads the photographs (they are part of its key).
+        prepares: True for a quick stage that only says more of the photographs: it runs whenever
+            they are named, even where the stages named leave it out.
     """
 
     name: ClassVar[str]
@@ -112,13 +114,15 @@ class Stage(ABC):
     libraries: ClassVar[tuple[str, ...]] = ()
     methods: ClassVar[Mapping[str, str]] = {}
     uses_sources: ClassVar[bool] = False
+    prepares: ClassVar[bool] = False
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
         """Name the user's files that the stage will read: their content enters its key.
 
         Args:
             config: the stage's validated config.
-            request: what the user asked for (`images`: list of paths).
+            request: what the user asked for (`images`: list of paths; `workspace`: its folder,
+                which may hold files of the user's).
 
         Returns:
             A stable label for each file (no folders: a moved case is the same case) -> its path.

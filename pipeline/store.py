@@ -7,10 +7,12 @@ Layout of a workspace::
     WORKSPACE/<stage>/<key12>.partial/    being written; `scratch/` inside survives a kill
     WORKSPACE/<stage>/current.json        which result is in use
     WORKSPACE/<stage>/failure.json        why the last try failed, until one succeeds
-    WORKSPACE/<stage>/failure/            pictures that show it, where there are any
+    WORKSPACE/<stage>/failure/            pictures that show it, and a folder per artifact kind of
+                                          what was made but isn't safe, where there are any
     WORKSPACE/request.json                what was asked for last
     WORKSPACE/results                     link to the exports in use
     WORKSPACE/report.html                 what the last run did, for people
+    WORKSPACE/check.html                  the teeth found, to put right; WORKSPACE/teeth.yaml: so
 """
 
 from __future__ import annotations
@@ -235,15 +237,32 @@ class Store:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
 
-    def keep_pictures(self, stage: str, images: Mapping[str, Any]) -> Path:
-        """Keep what a failed stage drew of the trouble, instead of what an earlier one drew."""
+    def keep_evidence(
+        self, stage: str, images: Mapping[str, Any], artifacts: Mapping[str, Any]
+    ) -> Path:
+        """Keep what a failed stage drew and made, instead of what an earlier failure left.
+
+        Args:
+            images: name -> picture of the trouble.
+            artifacts: kind -> artifact that was made, but isn't safe.
+        """
         from pipeline.artifacts.pictures import Pictures
 
         folder = self.root / stage / "failure"
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        Pictures(images).save(folder)
+        if images or artifacts:
+            folder.mkdir(parents=True)
+        if images:
+            Pictures(images).save(folder)
+        for kind, artifact in artifacts.items():
+            (folder / kind).mkdir()
+            artifact.save(folder / kind)
         return folder
+
+    def evidence(self, stage: str, kind: str) -> Any:
+        """The artifact that `keep_evidence` last kept of a failed stage, or None."""
+        folder = self.root / stage / "failure" / kind
+        return artifact_class(kind).load(folder) if folder.is_dir() else None
 
     def failure(self, stage: str) -> dict[str, Any] | None:
         """What `record_failure` last wrote, if no run has succeeded since."""

@@ -59,6 +59,8 @@ def print_summary(summary: RunSummary) -> None:
             console.print(f"Look at it: open {viewer} in a browser.", soft_wrap=True)
     else:
         console.print(f"\nResults: {summary.stages[-1].folder}/", soft_wrap=True)
+    if summary.check:
+        console.print(f"The teeth, to check and put right: {summary.check}", soft_wrap=True)
     if summary.report:
         console.print(f"How it went, with pictures: {summary.report}", soft_wrap=True)
 

@@ -21,6 +21,7 @@ KINDS: dict[str, str] = {
     "exports": "pipeline.artifacts.exports:Exports",
     "metrics": "pipeline.artifacts.metrics:Metrics",
     "pictures": "pipeline.artifacts.pictures:Pictures",
+    "teeth": "pipeline.artifacts.teeth:Teeth",
 }
 
 

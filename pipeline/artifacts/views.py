@@ -54,6 +54,16 @@ class View:
     def height(self) -> int:
         return int(self.image.shape[0])
 
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) in pixels of the photograph as it was taken, turned upright."""
+        width, height = self.source_size
+        if min(width, height) <= 0:
+            return self.width, self.height
+        linear = self.working_from_source[:2, :2]
+        lying = abs(linear[0, 1]) > abs(linear[0, 0])  # stored on its side
+        return (height, width) if lying else (width, height)
+
     def gray(self) -> npt.NDArray[np.uint8]:
         """[H, W] uint8 luma, as feature detectors and optical flow want it."""
         return np.asarray(cv2.cvtColor(to_uint8(self.image), cv2.COLOR_RGB2GRAY))

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 REPORT = "report.html"
+#: The page to put the teeth right, written beside the report where teeth were numbered.
+CHECK = "check.html"
 
 
 def run_report(workspace: str | Path) -> Path:
-    """Write ``WORKSPACE/report.html`` from what the workspace holds.
+    """Write ``WORKSPACE/report.html`` from what the workspace holds, and ``check.html`` beside it.
 
     Returns:
         The file.
@@ -37,4 +39,4 @@ def benchmark_report(results: dict[str, Any], out: str | Path) -> Path:
     return write_benchmark_report(results, Path(out))
 
 
-__all__ = ["REPORT", "benchmark_report", "run_report"]
+__all__ = ["CHECK", "REPORT", "benchmark_report", "run_report"]

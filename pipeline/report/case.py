@@ -107,6 +107,10 @@ class Case:
         names = self.providers(kind)
         return self.load(names[-1], kind) if names else None
 
+    def evidence(self, kind: str) -> Any:
+        """The artifact of a kind that the failed stage kept although it isn't safe, or None."""
+        return Store(self.workspace).evidence(self.failed.name, kind) if self.failed else None
+
     def warnings(self) -> Iterator[tuple[str, str]]:
         """(stage, warning) of all results."""
         for stage in self.stages:
@@ -145,8 +149,12 @@ def read_case(workspace: Path) -> Case:
     except PipelineError as error:
         notes.append(f"Whether results are stale can't be told: {error}")
         names = sorted(
-            path.parent.name for path in workspace.glob("*/current.json") if path.is_file()
-        )
+            {
+                path.parent.name
+                for left in ("current.json", "failure.json")
+                for path in workspace.glob(f"*/{left}") if path.is_file()
+            }
+        )  # fmt: skip
         order = list(config.run.stages) if config else []
         names.sort(key=lambda name: (order.index(name) if name in order else len(order), name))
         found = [StageStatus(name, "unknown") for name in names]

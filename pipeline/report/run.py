@@ -12,8 +12,9 @@ from typing import Any
 import yaml
 
 from pipeline.planning import library_version
-from pipeline.report import REPORT, compared, scored, sections
+from pipeline.report import CHECK, REPORT, check, compared, scored, sections
 from pipeline.report.case import Case, held_out_blocks, read_case, read_metrics
+from pipeline.report.check import write_check_page
 from pipeline.report.names import labels_of
 from pipeline.report.page import number, seconds, write_page
 from pipeline.report.tables import POSES, block_table, costs
@@ -41,10 +42,12 @@ def write_run_report(workspace: Path) -> Path:
             notes.append(f"The part '{title}' could not be drawn: {type(error).__name__}: {error}")
             return otherwise
 
+    to_check = drawn("page to put the teeth right", write_check_page, None)
     photographs = drawn("photographs", sections.photographs, None)
     metrics = drawn("metrics", read_metrics, {})
     content: dict[str, Any] = {
         "photographs": photographs,
+        "teeth": drawn("teeth", check.labelled, None),
         "matches": drawn("matches", sections.matches, None),
         "cameras": drawn("cameras", sections.cameras, None),
         "points": drawn("points", sections.points, None),
@@ -73,7 +76,7 @@ def write_run_report(workspace: Path) -> Path:
         facts=drawn("findings", lambda case: facts(case, photographs, metrics), []),
         links=links(case), settings=settings(case), versions=versions(case),
         command=command(case), date=time.strftime("%Y-%m-%d %H:%M"), training_note=TRAINING_NOTE,
-        diagnosis=diagnosis(case),
+        diagnosis=diagnosis(case), check=CHECK if to_check else "",
     )  # fmt: skip
 
 
@@ -221,6 +224,7 @@ def links(case: Case) -> list[tuple[str, str]]:
             ("results/splats.ply", "Splats (.ply)"),
             ("results/README.txt", "What the files are"),
         ]
+    named.append((CHECK, "Check the teeth"))
     named.append(("compare/report.html", "Comparison with COLMAP"))
     return [(path, text) for path, text in named if (case.workspace / path).is_file()]
 

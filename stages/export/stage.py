@@ -15,6 +15,8 @@ from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
 
 if TYPE_CHECKING:
+    from pipeline.artifacts.teeth import Teeth
+    from pipeline.artifacts.views import Views
     from stages.export.scene import Scene
     from stages.export.surface import Mesh
 
@@ -81,11 +83,11 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 2
-    summary = "viewer page, splats, mesh, video, COLMAP model and nerfstudio cameras"
+    version = 3
+    summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
-    optional = ("points",)
+    optional = ("points", "teeth")
     provides = ("exports",)
     libraries = (
         "av",
@@ -130,6 +132,8 @@ class ExportStage(Stage):
         write_gaussians_ply(folder / "splats.ply", scene.gaussians)
         if config.colmap:
             counts["colmap_points"] = _write_cameras(context, scene, folder, units)
+        if context.has("teeth"):
+            counts |= _write_teeth(context, views, scene, folder, config.frame, units)
         mesh = None
         if config.mesh:
             mesh = build_mesh(
@@ -184,6 +188,23 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, units: str
     models.write_json(folder / "transforms.json", transforms)
     context.progress("COLMAP model", 1, 1)
     return count
+
+
+def _write_teeth(
+    context: StageContext, views: Views, scene: Scene, folder: Path, frame: str, units: str
+) -> dict[str, int]:
+    """`teeth.json`, if there are teeth; returns their count, if so."""
+    from stages.export.models import write_json
+    from stages.export.teeth import describe_teeth
+
+    teeth: Teeth = context.load("teeth")
+    if not teeth.chosen:
+        return {}
+    found = describe_teeth(
+        teeth, views, scene.cameras, scene.seen, _frame_name(scene, frame), units
+    )
+    write_json(folder / "teeth.json", found)
+    return {"teeth": len(found["teeth"])}
 
 
 def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
@@ -247,6 +268,11 @@ def _write_preview(
     context.progress("preview", 1, 1)
 
 
+def _frame_name(scene: Scene, frame: str) -> str:
+    """What the frame of the exports is called: "world" where no other is known."""
+    return "world" if np.array_equal(scene.frame_from_world, np.eye(4)) else frame
+
+
 def _describe(
     scene: Scene,
     folder: Path,
@@ -260,10 +286,9 @@ def _describe(
     from stages.export.models import write_json
     from stages.export.texts import readme, scene_description
 
-    known = not np.array_equal(scene.frame_from_world, np.eye(4))
     description = scene_description(
         files=sorted(path.name for path in folder.iterdir()),
-        frame=frame if known else "world",
+        frame=_frame_name(scene, frame),
         units=units,
         up=scene.orbit.up.tolist(),
         similarity=scene.frame_from_world.tolist(),

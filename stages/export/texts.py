@@ -15,7 +15,15 @@ DESCRIPTIONS = {
     "points.ply": "thinned point cloud with colours",
     "colmap": "COLMAP model: images, and cameras and points in sparse/0",
     "transforms.json": "the cameras for nerfstudio (ns-train splatfacto --data .)",
+    "teeth.json": "the teeth: FDI and Universal number, doubt, place in 3D, outlines in the images",
 }
+
+TEETH = """\
+
+Teeth. teeth.json has {teeth} teeth. "doubt" is the probability that a number is wrong; check those
+above .2. "centre" is the middle of what is seen of a crown, in the frame above. Outlines are pixels
+of colmap/images. Photographs that were set aside are named there, with the reason.
+"""
 
 README = """\
 dentalsplat export
@@ -28,7 +36,7 @@ Axes are right-handed. Up in the photographs is ({up[0]:.4f}, {up[1]:.4f}, {up[2
 Cameras in colmap/ are OpenCV cameras (x right, y down, z forward); those in transforms.json
 have OpenGL axes (x right, y up, z backward) in the same world.
 Lengths are in {units}.{caution}
-
+{teeth}
 {placed} of {total} photographs could be placed. They appear as 000, 001, ... in the order in which
 they were given; no file names, places or times are carried along.
 """
@@ -91,4 +99,5 @@ def readme(scene: Mapping[str, Any]) -> str:
         caution="" if metric else " Nothing can be measured in them: no scale was known.",
         placed=scene["counts"]["placed_photographs"],
         total=scene["counts"]["photographs"],
+        teeth=TEETH.format(**scene["counts"]) if "teeth" in scene["counts"] else "",
     )

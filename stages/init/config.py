@@ -168,7 +168,7 @@ class ToothConfig(StageConfig):
     photo: str = Field(description="file name of the photograph")
     x: float = Field(description="a point on the crown, pixels of that photograph (upright)")
     y: float = Field(description="a point on the crown, pixels of that photograph (upright)")
-    tooth: int = Field(ge=11, le=47, description="its FDI number")
+    tooth: int = Field(ge=11, le=85, description="its FDI number")
 
 
 class DentalConfig(StageConfig):
@@ -179,7 +179,11 @@ class DentalConfig(StageConfig):
         description="what each photograph shows, in the order of the file names: right or left "
         "buccal, frontal, between; null: found out",
     )
-    labels: tuple[ToothConfig, ...] = Field((), description="teeth whose number is known")
+    labels: str | tuple[ToothConfig, ...] = Field(
+        (),
+        description="what a person says of the teeth: a file as the page check.html saves it, or "
+        "a list of teeth whose number is known; teeth.yaml in the workspace is used by itself",
+    )
     tooth_widths: dict[int, Annotated[float, Field(gt=2, lt=20)]] = Field(
         {}, description="known mesiodistal widths in mm by FDI number, for the scale"
     )

@@ -10,9 +10,11 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import StageContext
+from stages.geometry.crowns import dentition_of, outline_of
 from stages.geometry.known_cameras import KnownCamera, as_pinhole
 from stages.geometry.world import similarity_between
 from stages.init import cloud
@@ -20,12 +22,18 @@ from stages.init.config import InitConfig
 from stages.init.dense import DenseOptions, DenseView
 from stages.init.dense.reconstruct import complete_depths
 from stages.init.dental.cameras.centred import CentredView, centre_view
-from stages.init.dental.photo import PhotoOptions
-from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
+from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.surface.options import SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement
-from stages.init.teeth import arch_options, masked, neighbours, surface_options, tooth_counts
+from stages.init.teeth import (
+    arch_options,
+    labelled_teeth,
+    masked,
+    neighbours,
+    surface_options,
+    tooth_counts,
+)
 from stages.init.write import save_all
 
 Array = npt.NDArray[np.float64]
@@ -89,10 +97,13 @@ def from_known_teeth(
     centred = [centre_view(view, camera) for view, camera in pairs]
     names = [photo_name(view) for view in placed]
     arch = arch_options(config.dental, replace(views, views=tuple(placed)))
-    hints = []
-    for hint in arch.labels:
-        x, y = centred[hint.photo].point(hint.x, hint.y)
-        hints.append(replace(hint, x=x, y=y))
+    by_name = labelled_teeth(context, views).by_name()
+    chosen = [
+        moved(by_name[view.name], found)
+        if view.name in by_name and by_name[view.name].all_crowns
+        else None
+        for (view, _), found in zip(pairs, centred, strict=True)
+    ]
     surface = replace(
         surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
         least_facing=LEAST_FACING, gum_deviations=GUM_DEVIATIONS, carve=True,
@@ -100,9 +111,8 @@ def from_known_teeth(
     if config.dental.gum_height is None:
         surface = replace(surface, gum_height=GUM_HEIGHT)
     teeth = reconstruct_teeth(
-        [found.view for found in centred], names, [found.focal for found in centred],
-        PhotoOptions(), replace(arch, labels=tuple(hints)), surface,
-        accept_doubtful=config.dental.accept_doubtful, seed=context.seed, threads=context.threads,
+        [found.view for found in centred], names, chosen, [found.focal for found in centred],
+        arch, surface, accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
         progress=context.progress, cameras=[camera.cam_from_world for camera in cameras],
     )  # fmt: skip
     without = [name for name, view in zip(names, teeth.fit.views, strict=True) if view is None]
@@ -121,8 +131,21 @@ def from_known_teeth(
     ))  # fmt: skip
 
 
+def moved(dentition: Dentition, centred: CentredView) -> Dentition:
+    """A photograph's crowns in the pixels of the picture that was made of it."""
+    outlines = [
+        replace(
+            outline_of(crown),
+            polygon=np.array([centred.point(float(x), float(y)) for x, y in crown.outline]),
+        )
+        for crown in dentition.all_crowns
+    ]
+    size = (centred.view.width, centred.view.height)
+    return dentition_of(outlines, dentition.name, size, dentition.kind, dentition.roll)
+
+
 def _write(
-    context: StageContext, views: Views, teeth: Teeth, centred: list[CentredView],
+    context: StageContext, views: Views, teeth: Reconstruction, centred: list[CentredView],
     placement: Placement,
 ) -> None:  # fmt: skip
     config: InitConfig = context.config
@@ -179,7 +202,7 @@ def _write(
 
 
 def _completed(
-    context: StageContext, teeth: Teeth, centred: list[CentredView], placement: Placement,
+    context: StageContext, teeth: Reconstruction, centred: list[CentredView], placement: Placement,
     scale: float, turn: Array,
 ) -> list[DenseView]:  # fmt: skip
     """The surface as each photograph sees it, in units of the cameras, and what lies around it."""

@@ -69,12 +69,7 @@ def mm_per_unit(
 
 def working_pixel(view: View, point: tuple[float, float]) -> Array:
     """[2] pixel of the view for a pixel of the upright photograph."""
-    width, height = view.source_size
-    linear = view.working_from_source[:2, :2]
-    if abs(linear[0, 1]) > abs(linear[0, 0]):  # stored lying on its side
-        width, height = height, width
-    if min(width, height) <= 0:
-        return np.array(point, np.float64)
+    width, height = view.upright_size
     return np.array([point[0] * view.width / width, point[1] * view.height / height])
 
 

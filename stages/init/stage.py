@@ -14,6 +14,7 @@ from pipeline.stage import Stage, StageContext
 from stages.init.config import InitConfig
 
 if TYPE_CHECKING:
+    from pipeline.artifacts.teeth import Teeth
     from pipeline.checkup import Finding
     from stages.geometry.known_cameras import KnownCamera
     from stages.init.options import ClassicalOptions
@@ -28,12 +29,13 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 5
+    version = 6
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
+    optional = ("teeth",)
     provides = ("cameras", "points", "pointmaps")
-    may_provide = ("views", "pictures")  # undistorted; matches or labelled teeth
+    may_provide = ("views", "pictures", "teeth")  # undistorted; matches or labels; numbered
     libraries = ("pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
     methods = {  # noqa: RUF012
         "auto": "known where init.cameras is given; a model where init.pointmap.checkpoint is "
@@ -51,37 +53,18 @@ class InitStage(Stage):
     }
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from stages.geometry.known_cameras import model_files
+        from pipeline.artifacts.corrections import (
+            CORRECTIONS,
+            corrections_file,
+            read_corrections,
+        )
 
-        if config.cameras is not None:
-            if config.method not in ("auto", "known", "dental"):
-                raise RequestError(
-                    f"init.cameras is given, but init.method={config.method} would not use it. "
-                    "Leave one of them out."
-                )
-            files = model_files(Path(config.cameras))
-            if config.points == "model" and not any("points3D" in label for label in files):
-                raise RequestError(
-                    f"init.points=model: {config.cameras} holds no points. Give the folder of a "
-                    "COLMAP model with points3D.bin or points3D.txt, or leave init.points out."
-                )
-            return files
-        if config.points == "model":
-            raise RequestError(
-                "init.points=model takes the points of a COLMAP model, but none is given. Pass "
-                "--set init.cameras=FOLDER too."
-            )
-        if config.method == "known":
-            raise RequestError(
-                "init.method is known, but no cameras are given. Pass --set init.cameras=PATH with "
-                "the folder of a COLMAP model or a transforms.json."
-            )
-        options = _pointmap_options(config)
-        if options is None:
-            return {}
-        from stages.init.pointmap.predict import source_files
-
-        return source_files(options)
+        files = dict(_inputs(config))
+        said = corrections_file(config.dental.labels, request)
+        if said:
+            read_corrections(said)  # a wrong file is said before any work is done
+            files[CORRECTIONS] = said
+        return files
 
     def findings(self) -> Iterable[Finding]:
         from pipeline.checkup import Finding
@@ -122,6 +105,48 @@ class InitStage(Stage):
             _from_features(context, views)
 
 
+def _inputs(config: InitConfig) -> Mapping[str, Path]:
+    """The files that the settings name: cameras, or pointmaps and weights."""
+    from stages.geometry.known_cameras import model_files
+
+    if config.cameras is not None:
+        if config.method not in ("auto", "known", "dental"):
+            raise RequestError(
+                f"init.cameras is given, but init.method={config.method} would not use it. "
+                "Leave one of them out."
+            )
+        files = model_files(Path(config.cameras))
+        if config.points == "model" and not any("points3D" in label for label in files):
+            raise RequestError(
+                f"init.points=model: {config.cameras} holds no points. Give the folder of a "
+                "COLMAP model with points3D.bin or points3D.txt, or leave init.points out."
+            )
+        return files
+    if config.points == "model":
+        raise RequestError(
+            "init.points=model takes the points of a COLMAP model, but none is given. Pass "
+            "--set init.cameras=FOLDER too."
+        )
+    if config.method == "known":
+        raise RequestError(
+            "init.method is known, but no cameras are given. Pass --set init.cameras=PATH with "
+            "the folder of a COLMAP model or a transforms.json."
+        )
+    options = _pointmap_options(config)
+    if options is None:
+        return {}
+    from stages.init.pointmap.predict import source_files
+
+    return source_files(options)
+
+
+def _camera_files(sources: Mapping[str, Path]) -> list[Path]:
+    """The sources without what a person has said of the teeth."""
+    from pipeline.artifacts.corrections import CORRECTIONS
+
+    return [path for label, path in sources.items() if label != CORRECTIONS]
+
+
 def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
     """How to ask a pointmap model, or None where the method is another."""
     from stages.init.pointmap.options import METHODS, PointmapOptions
@@ -159,21 +184,20 @@ def _from_features(context: StageContext, views: Views) -> None:
             pictures=config.match_pictures,
         )  # fmt: skip
     except ReconstructionError as unplaced:
-        if config.method != "auto" or not _teeth_are_worth_a_try(views, context.threads):
+        if config.method != "auto" or not _teeth_are_worth_a_try(context, views):
             raise
         _from_teeth_instead(context, views, unplaced)
     else:
         densify(context, views, placement.normalised())
 
 
-def _teeth_are_worth_a_try(views: Views, threads: int) -> bool:
+def _teeth_are_worth_a_try(context: StageContext, views: Views) -> bool:
     """Few photographs, and of teeth: the dental path may place what features could not."""
-    from stages.init.dental.photo import teeth_likely
-
-    images = [view.image for view in views.views]
-    valid = [view.valid() for view in views.views]
-    few = DENTAL_VIEWS[0] <= len(views) <= DENTAL_VIEWS[1]
-    return few and teeth_likely(images, valid, threads=threads)
+    if not context.has("teeth"):
+        return False
+    teeth: Teeth = context.load("teeth")
+    shown = {dentition.name for dentition in teeth.chosen} & set(views.by_name())
+    return DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1]
 
 
 def _from_teeth_instead(context: StageContext, views: Views, unplaced: ReconstructionError) -> None:
@@ -187,6 +211,7 @@ def _from_teeth_instead(context: StageContext, views: Views, unplaced: Reconstru
             f"Neither the texture nor the teeth place these photographs safely. By texture: "
             f"{unplaced} By teeth: {doubtful}",
             doubtful.pictures or unplaced.pictures,
+            doubtful.artifacts,
         ) from doubtful
 
 
@@ -204,7 +229,7 @@ def _from_known_cameras(context: StageContext, views: Views) -> None:
     from stages.init.write import densify
 
     config: InitConfig = context.config
-    cameras, units = read_cameras(context.sources.values())
+    cameras, units = read_cameras(_camera_files(context.sources))
     known = matching_cameras(cameras, views.views)
     units = units if config.units == "auto" else config.units
     if config.points == "model":
@@ -246,7 +271,7 @@ def _teeth_are_wide_apart(
     posed = tuple(view for view in views.views if view.name in known)
     angle = neighbour_angle([pinhole_camera(view, known[view.name]) for view in posed])
     wide = angle > config.dental.wide_angle
-    return wide and _teeth_are_worth_a_try(replace(views, views=posed), context.threads)
+    return wide and _teeth_are_worth_a_try(context, replace(views, views=posed))
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:

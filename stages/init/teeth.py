@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,23 +10,30 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.corrections import (
+    CORRECTIONS,
+    Corrections,
+    CrownCorrection,
+    PhotoCorrection,
+    read_corrections,
+)
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.teeth import Dentition
+from pipeline.artifacts.teeth import Teeth as TeethArtifact
 from pipeline.artifacts.views import View, Views
-from pipeline.errors import RequestError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
+from stages.geometry.corrections import apply_corrections
 from stages.init import cloud
 from stages.init.config import DentalConfig, InitConfig
-from stages.init.dental.anatomy import LOWER_TEETH, UPPER_TEETH
-from stages.init.dental.numbering.arch_options import ArchOptions, ToothHint
-from stages.init.dental.photo import PhotoOptions
-from stages.init.dental.reconstruct import Teeth, reconstruct_teeth
+from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.geometry import Pair
 from stages.init.place import photo_name, with_focals
 from stages.init.placement import Placement
-from stages.init.scale import photo_named, working_pixel
 from stages.init.write import save_all
 
 Map = npt.NDArray[np.float32]
@@ -39,19 +47,82 @@ def from_teeth(context: StageContext, views: Views) -> None:
         RequestError: the settings of `init.dental` don't fit the photographs.
     """
     config: InitConfig = context.config
+    read = labelled_teeth(context, views)
+    dentitions = chosen_dentitions(read, views)
+    if config.dental.order is not None:
+        dentitions = [d or e for d, e in zip(dentitions, read.views, strict=True)]
     names = [photo_name(view) for view in views.views]
-    teeth = reconstruct_teeth(
-        list(views.views), names, with_focals(views.views, config.focal), PhotoOptions(),
-        arch_options(config.dental, views), surface_options(config.dental),
-        accept_doubtful=config.dental.accept_doubtful, seed=context.seed,
-        threads=context.threads, progress=context.progress,
-    )  # fmt: skip
-    for doubt in teeth.fit.doubts:
+    try:
+        teeth = reconstruct_teeth(
+            list(views.views), names, dentitions, with_focals(views.views, config.focal),
+            arch_options(config.dental, views), surface_options(config.dental),
+            accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
+            progress=context.progress,
+        )  # fmt: skip
+    except ReconstructionError as doubtful:
+        numbered = doubtful.artifacts.get("teeth")
+        if isinstance(numbered, TeethArtifact):
+            doubtful.artifacts["teeth"] = updated(read, numbered.views)
+        raise
+    for doubt in (*teeth.fit.doubts, *misnamed(names, teeth)):
         context.warn(doubt)
+    context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
     _write(context, views, teeth)
 
 
-def _write(context: StageContext, views: Views, teeth: Teeth) -> None:
+def labelled_teeth(context: StageContext, views: Views) -> TeethArtifact:
+    """The teeth that were read from the photographs, with what a person has said of them.
+
+    Raises:
+        RequestError: the stage `teeth` has not run, or what was said fits no crown.
+    """
+    if not context.has("teeth"):
+        raise RequestError(
+            "The teeth of these photographs have not been read. Name the stage `teeth` before "
+            "`init`, as in --stages teeth,init."
+        )
+    read: TeethArtifact = context.load("teeth")
+    for label, path in context.sources.items():
+        if label == CORRECTIONS:
+            read = apply_corrections(read, views, read_corrections(path))
+    said = context.config.dental.labels
+    if not isinstance(said, str) and said:
+        photographs: dict[str, PhotoCorrection] = {}
+        for hint in said:
+            before = photographs.get(hint.photo, PhotoCorrection())
+            crown = CrownCorrection((hint.x, hint.y), hint.tooth)
+            photographs[hint.photo] = replace(before, crowns=(*before.crowns, crown))
+        read = apply_corrections(read, views, Corrections(photographs, "init.dental.labels"))
+    return read
+
+
+def chosen_dentitions(read: TeethArtifact, views: Views) -> list[Dentition | None]:
+    """View by view its crowns, None where it takes no part."""
+    chosen = {dentition.name: dentition for dentition in read.chosen}
+    return [chosen.get(view.name) for view in views.views]
+
+
+def updated(read: TeethArtifact, numbered: Iterable[Dentition]) -> TeethArtifact:
+    """The teeth with some photographs' numbers replaced."""
+    new = {dentition.name: dentition for dentition in numbered}
+    return replace(read, views=tuple(new.get(view.name, view) for view in read.views), pictures={})
+
+
+def misnamed(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of photographs whose names call them the other side than their teeth show."""
+    other = {"right": "left", "left": "right"}
+    return [
+        f"{name} shows the patient's {placed.role} side by its teeth, although its name says "
+        f"{other[placed.role]}; the teeth are believed."
+        for name, placed in zip(names, teeth.fit.views, strict=True)
+        if placed is not None
+        and placed.role in other
+        and other[placed.role] in name.lower()
+        and placed.role not in name.lower()
+    ]
+
+
+def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     config: InitConfig = context.config
     surface = teeth.surface
     order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
@@ -99,7 +170,7 @@ def _write(context: StageContext, views: Views, teeth: Teeth) -> None:
         )
 
 
-def _camera(view: View, teeth: Teeth, number: int) -> Camera:
+def _camera(view: View, teeth: Reconstruction, number: int) -> Camera:
     placed = teeth.fit.views[number]
     assert placed is not None
     return Camera(
@@ -108,7 +179,7 @@ def _camera(view: View, teeth: Teeth, number: int) -> Camera:
     )  # fmt: skip
 
 
-def _masked(view: View, teeth: Teeth, number: int, mask_rest: bool) -> View:
+def _masked(view: View, teeth: Reconstruction, number: int, mask_rest: bool) -> View:
     """The view with what is not teeth or gum masked out."""
     found = teeth.surface.views[number]
     if not mask_rest or found is None:
@@ -121,7 +192,7 @@ def masked(view: View, depth: Map) -> View:
     return replace(view, mask=(depth > 0) & view.valid())
 
 
-def tooth_counts(teeth: Teeth) -> dict[str, float]:
+def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
     """Figures of the teeth found, for the summary."""
     placed = [view for view in teeth.fit.views if view is not None]
     return {
@@ -140,30 +211,19 @@ def neighbours(cameras: tuple[Camera, ...]) -> list[Pair]:
 
 
 def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
-    """The settings of the arch fit, with hints in pixels of the working images.
+    """The settings of the arch fit.
 
     Raises:
-        RequestError: an order or a label that doesn't fit the photographs.
+        RequestError: an order that doesn't fit the photographs.
     """
     if config.order is not None and len(config.order) != len(views):
         raise RequestError(
             f"init.dental.order names {len(config.order)} photographs "
             f"({','.join(config.order)}), but there are {len(views)}."
         )
-    hints = []
-    for label in config.labels:
-        if label.tooth not in UPPER_TEETH + LOWER_TEETH:
-            raise RequestError(
-                f"init.dental.labels: there is no tooth {label.tooth} here; FDI numbers are 11-17, "
-                "21-27, 31-37 and 41-47 (wisdom teeth are left out)."
-            )
-        view = photo_named(views, label.photo, "init.dental.labels")
-        x, y = working_pixel(view, (label.x, label.y))
-        number = next(k for k, other in enumerate(views.views) if other.name == view.name)
-        hints.append(ToothHint(number, float(x), float(y), label.tooth))
     shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
-    settings = {name: getattr(config, name) for name in shared - {"labels"}}
-    return ArchOptions(labels=tuple(hints), **settings)
+    settings = {name: getattr(config, name) for name in sorted(shared)}
+    return ArchOptions(**settings)
 
 
 def surface_options(config: DentalConfig) -> SurfaceOptions:

@@ -7,12 +7,14 @@ are; rays are intersected by marching. Nothing here uses the code under test.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from stages.init.dental.anatomy import Jaw, Landmark, teeth_of
-from stages.init.dental.observation import Crown, Dentition
+from pipeline.artifacts.fdi import Jaw, teeth_of
+from pipeline.artifacts.teeth import Crown, Dentition
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 
 AXIS = 26.0  # the arches curve around (0, y, -AXIS)
@@ -141,6 +143,12 @@ def render(pose: np.ndarray, glove: bool, exposure: float):  # type: ignore[no-u
     return np.clip(image, 0, 1).astype(np.float32), depth.astype(np.float32), jaw_of, kind_of
 
 
+def outline(mask: np.ndarray) -> np.ndarray:
+    """[K, 2] polygon around what a mask shows, piece by piece."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.concatenate([c[:, 0] + 0.5 for c in contours])
+
+
 def scene(yaws=(-40.0, 0.0, 40.0), missing=None, exposures=(0.9, 1.0, 1.0)):  # type: ignore[no-untyped-def]
     """Images, valid masks, dentitions, fit; and exact depth, jaw and kind maps.
 
@@ -157,15 +165,16 @@ def scene(yaws=(-40.0, 0.0, 40.0), missing=None, exposures=(0.9, 1.0, 1.0)):  # 
         images.append(image)
         truth.append((depth, jaw, kind))
         crowns, names = {}, {}
-        for model in JAWS:
+        for number, model in enumerate(JAWS, 1):
             kept = [t for t in TEETH[model.jaw] if t != missing]
             facing = [t for t in kept if abs(np.degrees(model.centres()[t]) - yaw) < 75]
+            # All the jaw's enamel is outlined, in one piece: the crowns have no landmarks here.
             crown = Crown(model.jaw, np.zeros(2), np.zeros(2), None, None, None, None, 15.0, 22.0)
-            crowns[model.jaw], names[model.jaw] = (crown,) * len(facing), tuple(facing)
-        # Above the upper teeth's lower border is upper: the jaws overlap without a gap.
-        above = np.cumsum(jaw == 2, axis=0) == 0
-        above &= np.arange(HEIGHT)[:, None] < HEIGHT / 2 + 9
-        dentitions.append(Dentition(crowns["upper"], crowns["lower"], kind == 2, above, 0.0, 50.0))
+            whole = replace(crown, outline=outline((kind == 2) & (jaw == number)))
+            crowns[model.jaw] = (whole, *(crown,) * (len(facing) - 1))
+            names[model.jaw] = tuple(facing)
+        size = (WIDTH, HEIGHT)
+        dentitions.append(Dentition("", size, "other", crowns["upper"], crowns["lower"], 0.0, 50.0))
         placed.append(
             PlacedView(pose, FOCAL, roles.get(yaw, "between"), names["upper"], names["lower"], 0.5)
         )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.init.dental.anatomy import Landmark
-from stages.init.dental.observation import Dentition
+from pipeline.artifacts.teeth import Crown, Dentition
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.chart import (
     AXIS_DEPTH,
@@ -245,6 +245,12 @@ def test_offsets_fit_is_the_thin_plate_and_robust() -> None:
     np.testing.assert_array_equal(nothing, 0)
 
 
+def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    """[4, 2] outline through the middles of the outermost pixels."""
+    corners = [(left, top), (right - 1, top), (right - 1, bottom - 1), (left, bottom - 1)]
+    return np.array(corners) + 0.5
+
+
 def test_gum_is_found_beside_the_teeth_and_gloves_are_not() -> None:
     height, width = 120, 200
     lab = np.zeros((height, width, 3), np.float32)
@@ -256,8 +262,12 @@ def test_gum_is_found_beside_the_teeth_and_gloves_are_not() -> None:
     lab += np.random.default_rng(0).normal(0, 2, lab.shape).astype(np.float32)
     tooth = np.zeros((height, width), bool)
     tooth[45:75, 40:160] = True
-    above = np.arange(height)[:, None] < np.full((1, width), 60)
-    dentition = Dentition((), (), tooth, above, 0.0, 30.0)
+    rows = [
+        Crown(jaw, *np.zeros((2, 2)), *[None] * 4, 9.0, 9.0, outline=rectangle(40, top, 160, end))
+        for jaw, top, end in (("upper", 45, 60), ("lower", 60, 75))
+    ]
+    dentition = Dentition("", (width, height), "front", (rows[0],), (rows[1],), 0.0, 30.0)
+    np.testing.assert_array_equal(dentition.mask, tooth)
     gum = find_gum(lab, tooth, dentition, density=4.0, deviations=3.5)
     assert gum[30:43, 30:170].mean() > 0.98
     assert gum[78:97, 30:170].mean() > 0.98

@@ -11,7 +11,7 @@ from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init import teeth
 from stages.init.config import DentalConfig, InitConfig
-from stages.init.dental.anatomy import Landmark
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.reconstruct import Teeth
 from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.dental.solution import ArchFit, PlacedView

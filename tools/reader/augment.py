@@ -22,6 +22,7 @@ class Example:
     Attributes:
         image: [3, HEIGHT, WIDTH] float32, normalised; 0 outside the photograph.
         tooth, inside: [h, w] float32 0..1, at half the size.
+        border: [h, w] float32: 1 where two crowns touch.
         centre: [2, h, w] float32 offset to the crown's centre in units.
         number: [h, w] uint8 FDI, `UNNUMBERED` or 0.
         valid: [h, w] float32: inside the photograph.
@@ -31,6 +32,7 @@ class Example:
     image: Array
     tooth: Array
     inside: Array
+    border: Array
     centre: Array
     number: npt.NDArray[np.uint8]
     valid: Array
@@ -209,12 +211,21 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
         image=np.ascontiguousarray(normal.transpose(2, 0, 1)),
         tooth=np.asarray(tooth, np.float32),
         inside=inside.astype(np.float32) / 255,
+        border=_borders(crowns),
         centre=_offsets(crowns),
         number=np.ascontiguousarray(number),
         valid=seen[::2, ::2].astype(np.float32),
         view=view,
         bite=bite,
     )
+
+
+def _borders(crowns: npt.NDArray[np.uint8]) -> Array:
+    """[h, w] 1 where pixels of two crowns lie within one pixel."""
+    around = np.ones((3, 3), np.uint8)
+    highest = cv2.dilate(crowns, around)
+    lowest = 255 - cv2.dilate(np.where(crowns > 0, 255 - crowns, 0).astype(np.uint8), around)
+    return ((highest > 0) & (highest != lowest)).astype(np.float32)
 
 
 def _offsets(crowns: npt.NDArray[np.uint8]) -> Array:

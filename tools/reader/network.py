@@ -6,14 +6,15 @@ same network with its normalisation folded in, written by `export.py` and run by
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 WIDTH, HEIGHT = 448, 320
 #: The answer's channels, in order. Positions run from the central incisor (1) to the third molar.
 TOOTH, INSIDE, CENTRE, JAW, SIDE, PRIMARY, POSITION = 0, 1, slice(2, 4), 4, 5, 6, slice(7, 15)
-CHANNELS = 15
+#: Where two crowns touch.
+BORDER = 15
+CHANNELS = 16
 #: What kind of photograph it is, and (last) whether the jaws are apart.
 VIEWS = ("front", "right", "left", "upper", "lower", "other")
 #: Pixels of the answer in which offsets to the crown's centre are counted.
@@ -44,7 +45,7 @@ def convolution(before: int, after: int, stride: int = 1, size: int = 3) -> nn.S
 
 
 class Reader(nn.Module):
-    """[N, 3, HEIGHT, WIDTH] normalised RGB -> ([N, 15, HEIGHT/2, WIDTH/2], [N, 7])."""
+    """[N, 3, HEIGHT, WIDTH] normalised RGB -> ([N, 16, HEIGHT/2, WIDTH/2], [N, 7])."""
 
     def __init__(self, widths: tuple[int, ...] = (16, 32, 64, 128, 160)) -> None:
         super().__init__()

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 #: FDI number -> that of the tooth in the same place on the other side.
 MIRRORED = np.arange(256, dtype=np.uint8)
-for _tooth in range(11, 90):
+for _tooth in range(10, 90):
     _quadrant, _place = divmod(_tooth, 10)
     if 1 <= _quadrant <= 8:
         MIRRORED[_tooth] = 10 * (_quadrant + 1 if _quadrant % 2 else _quadrant - 1) + _place

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from augment import Example, example
-from network import CENTRE, INSIDE, JAW, POSITION, PRIMARY, SIDE, TOOTH, VIEWS, Reader
+from network import BORDER, CENTRE, INSIDE, JAW, POSITION, PRIMARY, SIDE, TOOTH, VIEWS, Reader
 from samples import UNNUMBERED, Sample, read_generated, read_labelled
 from torch import Tensor
 from torch.nn import functional as F
@@ -45,7 +45,7 @@ class Stream(torch.utils.data.IterableDataset):
 
 def collate(examples: list[Example]) -> dict[str, Tensor]:
     """Examples side by side."""
-    fields = ("image", "tooth", "inside", "centre", "number", "valid", "view", "bite")
+    fields = ("image", "tooth", "inside", "border", "centre", "number", "valid", "view", "bite")
     return {
         name: torch.from_numpy(np.stack([np.asarray(getattr(e, name)) for e in examples]))
         for name in fields
@@ -60,6 +60,9 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
     share = torch.sigmoid(logit) * valid
     dice = 1 - (2 * (share * tooth).sum((1, 2)) + 1) / (share.sum((1, 2)) + tooth.sum((1, 2)) + 1)
     inside = (torch.sigmoid(answer[:, INSIDE]) - batch["inside"]).abs() * valid * (0.3 + tooth)
+    border = F.binary_cross_entropy_with_logits(
+        answer[:, BORDER], batch["border"], reduction="none", pos_weight=torch.tensor(4.0)
+    )
     on_tooth = (number > 0).float()
     area = on_tooth.sum().clamp(min=1)
     centre = (answer[:, CENTRE] - batch["centre"]).abs().sum(1) * on_tooth
@@ -82,6 +85,7 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
     result = {
         "tooth": (entropy * valid).mean() + 0.5 * dice.mean(),
         "inside": 2 * inside.mean(),
+        "border": 0.5 * (border * valid).mean(),
         "centre": 0.2 * centre.sum() / area,
         "jaw": 0.3 * binary(JAW, (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)),
         "side": 0.3

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from stages.geometry.teeth_overlay import labelled_overlay, sheet
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.observation import Dentition
-from stages.init.dental.photo import PhotoOptions, read_dentitions
-from stages.init.dental.pictures.overlay import labelled_overlay, sheet
 from stages.init.dental.pictures.turned import turned_sheet
-from stages.init.dental.solution import ArchFit
+from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
 
@@ -32,11 +32,11 @@ HOW_TO_SHOOT_TEETH = (
 
 
 @dataclass(frozen=True)
-class Teeth:
+class Reconstruction:
     """What `reconstruct_teeth` found.
 
     Attributes:
-        dentitions: the teeth in each photograph; None where none were found.
+        dentitions: the teeth in each photograph with their numbers; None where none are used.
         fit: cameras and named landmarks.
         surface: dense depth of each placed view, and one cloud.
         pictures: for people to check: the labelled photographs, the cloud turned.
@@ -49,58 +49,72 @@ class Teeth:
 
 
 def reconstruct_teeth(
-    views: list[View], names: list[str], focals: list[float | None], photo: PhotoOptions,
-    arch: ArchOptions, surface: SurfaceOptions, *, accept_doubtful: bool, seed: int, threads: int,
-    progress: Progress, cameras: list[Array] | None = None,
-) -> Teeth:  # fmt: skip
-    """Find the teeth, say which is which, place the cameras, and make the surface.
+    views: list[View], names: list[str], dentitions: list[Dentition | None],
+    focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
+    accept_doubtful: bool, threads: int, progress: Progress, cameras: list[Array] | None = None,
+) -> Reconstruction:  # fmt: skip
+    """Say which tooth is which, place the cameras, and make the surface.
 
     Args:
-        views: three or more photographs of one patient's teeth, in any order.
+        views: photographs of one patient's teeth, in any order.
         names: how the user knows them.
+        dentitions: the crowns of each; None: it takes no part.
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
         cameras: [4, 4] cam_from_world of each where the cameras are known (`fit_arch`).
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
-            with it, so that the user sees what was taken for what.
+            with it, and the teeth with their numbers, so that the user can put them right.
     """
     images = [view.image for view in views]
     valid = [view.valid() for view in views]
-    progress("find teeth", 0, len(views))
-    dentitions = read_dentitions(images, valid, photo, threads)
-    progress("find teeth", len(views), len(views))
     found = sum(dentition is not None for dentition in dentitions)
     if found < 2:
         raise ReconstructionError(
-            f"Teeth could be made out in {found} of {len(views)} photographs; three are needed. "
-            f"{HOW_TO_SHOOT_TEETH}"
+            f"Rows of teeth could be made out in {found} of {len(views)} photographs; three are "
+            f"needed. {HOW_TO_SHOOT_TEETH}"
         )
-    fit = fit_arch(dentitions, images, valid, focals, arch, seed, threads, progress, names, cameras)
-    pictures = labelled(views, dentitions, fit)
+    fit = fit_arch(dentitions, images, valid, focals, arch, threads, progress, names, cameras)
+    numbered = [
+        None if dentition is None else with_numbers(dentition, placed, fit)
+        for dentition, placed in zip(dentitions, fit.views, strict=True)
+    ]
+    pictures = labelled(views, numbered)
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
         shown = [f"{doubt[0].upper()}{doubt[1:].rstrip('.')}." for doubt in fit.doubts]
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
-            "Check the labelled photographs; a wrong or missing number can be put right with "
-            "--set init.dental.labels and the order of the photographs with --set "
-            f"init.dental.order. {HOW_TO_SHOOT_TEETH}",
+            "Check the numbers in the labelled photographs; a wrong one can be put right on the "
+            f"page check.html. {HOW_TO_SHOOT_TEETH}",
             pictures,
+            {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
-    dense = dense_surface(images, valid, dentitions, fit, surface, threads, progress)
-    return Teeth(dentitions, fit, dense, {**pictures, "turned": turned_sheet(dense)})
+    dense = dense_surface(images, valid, numbered, fit, surface, threads, progress)
+    return Reconstruction(numbered, fit, dense, {**pictures, "turned": turned_sheet(dense)})
 
 
-def labelled(
-    views: list[View], dentitions: list[Dentition | None], fit: ArchFit
-) -> dict[str, Picture]:
+def with_numbers(dentition: Dentition, placed: PlacedView | None, fit: ArchFit) -> Dentition:
+    """The dentition with the numbers that all photographs together give its crowns."""
+    if placed is None:
+        return dentition
+    rows: dict[Jaw, tuple[Crown, ...]] = {}
+    for jaw, doubts in zip(JAWS, (placed.upper_doubts, placed.lower_doubts), strict=True):
+        rows[jaw] = tuple(
+            replace(crown, number=fit.number_of(tooth), doubt=doubt if crown.doubt else 0.0)
+            for crown, tooth, doubt in zip(
+                dentition.crowns(jaw), placed.teeth(jaw), doubts, strict=True
+            )
+        )
+    return replace(dentition, upper=rows["upper"], lower=rows["lower"])
+
+
+def labelled(views: list[View], dentitions: list[Dentition | None]) -> dict[str, Picture]:
     """Name -> picture: each photograph with the numbers of its teeth, and all beside each other."""
-    pictures = {}
-    for view, dentition, placed in zip(views, dentitions, fit.views, strict=True):
-        if dentition is not None:
-            upper = placed.upper if placed else (0,) * len(dentition.upper)
-            lower = placed.lower if placed else (0,) * len(dentition.lower)
-            pictures[f"teeth_{view.name}"] = labelled_overlay(view.image, dentition, upper, lower)
+    pictures = {
+        f"teeth_{view.name}": labelled_overlay(view.image, dentition)
+        for view, dentition in zip(views, dentitions, strict=True)
+        if dentition is not None
+    }
     return {"teeth": sheet(list(pictures.values())), **pictures}

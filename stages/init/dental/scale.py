@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pipeline.artifacts.fdi import teeth_of
 from pipeline.errors import RequestError
-from stages.init.dental.anatomy import Landmark, teeth_of
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit
 
 #: Relative standard deviation of a crown's width as it comes out between its landmarks.

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.anatomy import Jaw, Landmark
+from pipeline.artifacts.fdi import Jaw, primary_of
+from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]
 
@@ -22,8 +23,10 @@ class PlacedView:
             incisors' biting edges.
         focal: pixels of the working image; the principal point is its centre.
         role: `right`, `frontal`, `left` (buccal), or `between`.
-        upper, lower: FDI number of each crown of the `Dentition`, in its order; 0 where a crown is
-            taken for no tooth (a bracket, a glove, a split outline).
+        upper, lower: FDI number of each crown of the `Dentition`, in its order, that of the
+            permanent tooth in its place; 0 where a crown is taken for no tooth (a bracket, a glove,
+            a split outline).
+        upper_doubts, lower_doubts: 0..1 of each, that the number is another one.
         error: median reprojection error of the landmarks in pixels.
     """
 
@@ -33,6 +36,8 @@ class PlacedView:
     upper: tuple[int, ...]
     lower: tuple[int, ...]
     error: float
+    upper_doubts: tuple[float, ...] = ()
+    lower_doubts: tuple[float, ...] = ()
 
     def teeth(self, jaw: Jaw) -> tuple[int, ...]:
         """FDI numbers of the crowns of one jaw."""
@@ -50,6 +55,8 @@ class ArchFit:
         margin: by how much the labelling chosen is better than the next one (log evidence).
         doubts: sentences for the user why the result should not be trusted; empty: trust it.
         scale_uncertainty: relative standard deviation of the millimetres.
+        figures: what the doubts rest on.
+        primary: permanent numbers in whose place primary teeth stand.
     """
 
     views: tuple[PlacedView | None, ...]
@@ -59,3 +66,8 @@ class ArchFit:
     doubts: tuple[str, ...] = ()
     scale_uncertainty: float = 0.15
     figures: dict[str, float] = field(default_factory=dict)
+    primary: frozenset[int] = frozenset()
+
+    def number_of(self, tooth: int) -> int:
+        """FDI number of the tooth that stands in the place of a permanent one; 0 for 0."""
+        return primary_of(tooth) if tooth in self.primary else tooth

@@ -13,7 +13,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.anatomy import Jaw, Landmark, is_upper, teeth_of
+from pipeline.artifacts.fdi import Jaw, is_upper, teeth_of
+from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +27,15 @@ WIDTHS: dict[Jaw, tuple[float, ...]] = {
 HEIGHTS: dict[Jaw, tuple[float, ...]] = {
     "upper": (9.6, 8.2, 9.0, 7.6, 6.8, 6.2, 5.5),
     "lower": (8.2, 8.4, 9.3, 8.0, 7.0, 6.6, 5.8),
+}
+#: The same of primary teeth, central incisor to second molar.
+PRIMARY_WIDTHS: dict[Jaw, tuple[float, ...]] = {
+    "upper": (6.5, 5.1, 7.0, 7.3, 8.2),
+    "lower": (4.2, 4.1, 5.0, 7.7, 9.9),
+}
+PRIMARY_HEIGHTS: dict[Jaw, tuple[float, ...]] = {
+    "upper": (6.0, 5.6, 6.5, 5.1, 5.7),
+    "lower": (5.0, 5.2, 6.0, 6.0, 5.5),
 }
 #: Half width and depth of each arch's curve (mm).
 ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (30.5, 46.0), "lower": (28.0, 43.0)}
@@ -85,14 +95,19 @@ def _arch_curve(half_width: float, depth: float, length: float) -> tuple[Array, 
     return arc * (length / arc[-1]), x, z
 
 
-def _half_jaw(jaw: Jaw, absent: frozenset[int]) -> Array:
+def _half_jaw(jaw: Jaw, absent: frozenset[int], primary: frozenset[int]) -> Array:
     """Landmarks of a jaw's left half: [4, 8, 3] by kind and position from the midline.
+
+    Absent and primary teeth are named by their index from the midline, from 0.
 
     Of papillae and embrasures, position i is the mesial one of tooth i.
     """
     upper = jaw == "upper"
-    widths = np.array([0.0 if i in absent else w for i, w in enumerate(WIDTHS[jaw])])
-    heights = np.array(HEIGHTS[jaw])
+    usual = [PRIMARY_WIDTHS[jaw][i] if i in primary else w for i, w in enumerate(WIDTHS[jaw])]
+    widths = np.array([0.0 if i in absent else w for i, w in enumerate(usual)])
+    heights = np.array(
+        [PRIMARY_HEIGHTS[jaw][i] if i in primary else h for i, h in enumerate(HEIGHTS[jaw])]
+    )
     arc, x, z = _arch_curve(*ARCH_SIZE[jaw], float(sum(WIDTHS[jaw])))
     borders = np.concatenate([[0.0], np.cumsum(widths)])
     towards_gum = 1.0 if upper else -1.0
@@ -132,13 +147,22 @@ def _half_jaw(jaw: Jaw, absent: frozenset[int]) -> Array:
     return points
 
 
+def _side_of(teeth: frozenset[int], jaw: Jaw, side: int) -> frozenset[int]:
+    """Indices from the midline of those of some teeth that are in a jaw's half (1: left)."""
+    positions = [position_of(t) for t in teeth if is_upper(t) == (jaw == "upper")]
+    return frozenset(p - 7 if side == 1 else 6 - p for p in positions if (p >= 7) == (side == 1))
+
+
 @lru_cache(maxsize=128)
-def textbook_arch(closed_gaps: frozenset[int] = frozenset()) -> Array:
+def textbook_arch(
+    closed_gaps: frozenset[int] = frozenset(), primary: frozenset[int] = frozenset()
+) -> Array:
     """Positions of all landmarks of `landmark_names` on the textbook arch.
 
     Args:
         closed_gaps: FDI numbers of teeth that are missing and whose space the teeth behind have
             closed. Their landmarks are placed where the neighbours meet.
+        primary: numbers of the permanent teeth (11-45) in whose place primary ones stand.
 
     Returns:
         [L, 3] float64, mm, arch frame. Not to be written to (it is cached).
@@ -147,14 +171,8 @@ def textbook_arch(closed_gaps: frozenset[int] = frozenset()) -> Array:
     jaws: tuple[Jaw, Jaw] = ("upper", "lower")
     for jaw in jaws:
         for side in (1, -1):
-            absent = frozenset(
-                (position - 7 if side == 1 else 6 - position)
-                for position in (
-                    position_of(t) for t in closed_gaps if is_upper(t) == (jaw == "upper")
-                )
-                if (position >= 7) == (side == 1)
-            )
-            half = _half_jaw(jaw, absent) * np.array([side, 1, 1])
+            absent, milk = (_side_of(teeth, jaw, side) for teeth in (closed_gaps, primary))
+            half = _half_jaw(jaw, absent, milk) * np.array([side, 1, 1])
             for i in range(TEETH_A_SIDE):
                 position = 7 + i if side == 1 else 6 - i
                 result[landmark_index(jaw, ZENITH, position)] = half[0, i]

@@ -14,14 +14,25 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.fdi import JAWS, permanent_of, teeth_of
+from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
-from stages.init.dental.anatomy import Landmark, is_upper
+from stages.geometry.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import view_angles
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
 from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo
-from stages.init.dental.numbering.arch_options import ArchOptions, ToothHint
+from stages.init.dental.landmarks import Landmark
+from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.confidence import crown_doubts, fit_doubts, landmark_errors
-from stages.init.dental.numbering.edits import MIN_GAIN, Fixed, improve, margins, solve_shifted
+from stages.init.dental.numbering.edits import (
+    MIN_GAIN,
+    Fixed,
+    common_mouth,
+    improve,
+    label_doubts,
+    margins,
+    solve_shifted,
+)
 from stages.init.dental.numbering.hypotheses import (
     MAIN_ROLES,
     Scored,
@@ -30,12 +41,12 @@ from stages.init.dental.numbering.hypotheses import (
     search,
     view_candidates,
 )
-from stages.init.dental.numbering.sightings import JAWS, NO_TOOTH, Labels, seen_rows
-from stages.init.dental.observation import Dentition
+from stages.init.dental.numbering.primary import primary_teeth
+from stages.init.dental.numbering.sightings import seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
 
-__all__ = ["ArchOptions", "ToothHint", "fit_arch"]
+__all__ = ["ArchOptions", "fit_arch"]
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -50,6 +61,8 @@ EDITED, EDIT_WINDOW = 6, 60.0
 SHIFTS, EDIT_GAP = 3, 30.0
 #: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
 MATCHED_YAW = 32.0
+#: Shapes of photographs as cameras take them (long over short side), told apart to this share.
+SENSOR_SHAPES, SHAPE_TOLERANCE = (4 / 3, 3 / 2, 16 / 9), 0.01
 #: How far away known cameras are, they say themselves: hardly any prior (relative deviation).
 HELD_DISTANCE_DEVIATION = 0.5
 #: The millimetres rest on the focal length or distance expected: relative standard deviation.
@@ -62,7 +75,6 @@ def fit_arch(
     valid: list[Mask],
     focals: list[float | None],
     options: ArchOptions,
-    seed: int,
     threads: int,
     progress: Progress,
     names: list[str] | None = None,
@@ -71,12 +83,12 @@ def fit_arch(
     """Name the teeth and place the cameras of a few photographs of one patient's closed bite.
 
     Args:
-        dentitions: what was read from each photograph (`photo.read_dentitions`), None: nothing.
+        dentitions: the crowns of each photograph, None: it takes no part. A crown whose doubt is 0
+            keeps its number.
         images: [H, W, 3] float32 RGB, 0 to 1, of each.
         valid: [H, W] bool of each; outside, nothing is matched.
         focals: known focal lengths in pixels of the working image, or None. They are held.
         options: settings.
-        seed: unused; nothing here is random.
         threads: threads to use; the result does not depend on them.
         progress: told (step, done, total).
         names: how the user knows the photographs; None: "photo 0", "photo 1", ...
@@ -88,10 +100,9 @@ def fit_arch(
         there and named among the doubts; with fewer than two left all are.
 
     Raises:
-        RequestError: `options.order` or `options.labels` don't fit the photographs.
+        RequestError: `options.order` doesn't fit the photographs, or numbers contradict.
         ValueError: the lists are not of one length.
     """
-    del seed
     _check(dentitions, images, valid, focals, options)
     if cameras is not None:
         options = replace(options, distance_deviation=HELD_DISTANCE_DEVIATION)
@@ -99,10 +110,8 @@ def fit_arch(
     doubts: list[str] = []
     placeable = []
     for index, dentition in enumerate(dentitions):
-        if dentition is None or not dentition.upper or not dentition.lower:
-            doubts.append(
-                f"{names[index]} could not be placed: no two rows of teeth were found in it"
-            )
+        if dentition is None:
+            doubts.append(f"{names[index]} could not be placed: no row of teeth was found in it")
         elif len(dentition.upper) + len(dentition.lower) < MIN_CROWNS:
             doubts.append(f"{names[index]} could not be placed: it shows too few crowns")
         else:
@@ -115,32 +124,39 @@ def fit_arch(
         options,
         order=None if options.order is None else tuple(options.order[i] for i in placeable),
     )
-    fixed = _fixed_labels(options.labels, placeable, read, names)
+    fixed = _fixed_labels(read)
     focal, deviation = _focal_priors([focals[i] for i in placeable], read, options)
     rows = [seen_rows(dentition) for dentition in read]
+    primary = primary_teeth(read, rows)
     shown = [names[i] for i in placeable]
 
     rolls = [dentition.roll for dentition in read]
     held = None if cameras is None else held_cameras([cameras[i] for i in placeable], rolls)
-    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held)
+    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held, primary)
     best, others = _label(scorer, fixed, progress)
     if inner.order is not None:
         best, others, scorer, contradiction = _keep_order(
-            Scorer(rows, focal, deviation, inner, threads, held), fixed, scorer, best, others,
-            shown, progress,
+            Scorer(rows, focal, deviation, inner, threads, held, primary), fixed, scorer, best,
+            others, shown, progress,
         )  # fmt: skip
         doubts += contradiction
     elif len(placeable) == 3:
         doubts += _role_doubts(best)
     gaps = margins(best, others)
+    shares = label_doubts(best, others)
+    common = common_mouth(scorer, best)
 
     best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],
                           [valid[i] for i in placeable], options, progress)  # fmt: skip
     bands = [dentition.band_height for dentition in read]
     doubts += crown_doubts(shown, read, options)
-    more, figures = fit_doubts(shown, bands, scorer, best, gaps, pairs, options)
+    figures = {f"common_mouth_{view}": gain for view, gain in enumerate(common)}
+    more, measured = fit_doubts(shown, bands, scorer, best, gaps, pairs, options)
     doubts += more
-    return _outcome(scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures)
+    figures |= measured
+    return _outcome(
+        scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures, shares
+    )
 
 
 def _check(
@@ -166,39 +182,15 @@ def _check(
             )
 
 
-def _fixed_labels(
-    hints: tuple[ToothHint, ...], placeable: list[int], dentitions: list[Dentition],
-    names: list[str],
-) -> Fixed:  # fmt: skip
-    """Hints to (view, jaw, crown) -> position; the nearest crown of the tooth's jaw is meant."""
+def _fixed_labels(dentitions: list[Dentition]) -> Fixed:
+    """Crowns whose number a person has said (doubt 0) -> position."""
     fixed: Fixed = {}
-    for hint in hints:
-        if hint.photo not in placeable:
-            raise RequestError(
-                f"The hint for tooth {hint.tooth} names {names[hint.photo]}, in which no teeth "
-                f"were found; photographs with teeth: {', '.join(names[i] for i in placeable)}."
-            )
-        try:
-            position = position_of(hint.tooth)
-        except ValueError:
-            raise RequestError(
-                f"The hint for {names[hint.photo]} names tooth {hint.tooth}, which is no FDI "
-                f"number of a permanent tooth from incisor to second molar (11-17, 21-27, 31-37, "
-                f"41-47)."
-            ) from None
-        jaw = 0 if is_upper(hint.tooth) else 1
-        view = placeable.index(hint.photo)
-        crowns = dentitions[view].crowns(JAWS[jaw])
-        point = np.array([hint.x, hint.y])
-        distances = [float(np.linalg.norm((c.zenith + c.tip) / 2 - point)) for c in crowns]
-        nearest = int(np.argmin(distances))
-        if distances[nearest] > crowns[nearest].height:
-            raise RequestError(
-                f"The hint for tooth {hint.tooth} points at ({hint.x:.0f}, {hint.y:.0f}) in "
-                f"{names[hint.photo]}, where there is no {JAWS[jaw]} crown; the nearest is at "
-                f"({crowns[nearest].zenith[0]:.0f}, {crowns[nearest].zenith[1]:.0f})."
-            )
-        fixed[view, jaw, nearest] = position
+    for view, dentition in enumerate(dentitions):
+        for jaw, name in enumerate(JAWS):
+            for crown, found in enumerate(dentition.crowns(name)):
+                tooth = permanent_of(found.number) if found.number else 0
+                if found.doubt == 0 and tooth in teeth_of(name):
+                    fixed[view, jaw, crown] = position_of(tooth)
     return fixed
 
 
@@ -207,11 +199,24 @@ def _focal_priors(
 ) -> tuple[Array, Array]:
     """Focal lengths in pixels and their relative standard deviations (0 where known)."""
     values, deviations = [], []
+    cropped = looks_cropped([dentition.size for dentition in dentitions])
+    unknown = options.cropped_focal_deviation if cropped else options.focal_deviation
     for focal, dentition in zip(focals, dentitions, strict=True):
         # Of the long side: turning the camera upright does not change its lens.
-        values.append(focal or options.focal_per_side * max(dentition.mask.shape))
-        deviations.append(0.0 if focal else options.focal_deviation)
+        values.append(focal or options.focal_per_side * max(dentition.size))
+        deviations.append(0.0 if focal else unknown)
     return np.array(values, np.float64), np.array(deviations, np.float64)
+
+
+def looks_cropped(sizes: list[tuple[int, int]]) -> bool:
+    """Were some of these photographs cut by hand? Whole ones have a sensor's shape, all the same.
+
+    Args:
+        sizes: width and height of each.
+    """
+    ratios = [max(size) / min(size) for size in sizes]
+    whole = any(abs(ratios[0] / shape - 1) < SHAPE_TOLERANCE for shape in SENSOR_SHAPES)
+    return not whole or max(ratios) / min(ratios) > 1 + SHAPE_TOLERANCE
 
 
 def _label(scorer: Scorer, fixed: Fixed, progress: Progress) -> tuple[Scored, list[Scored]]:
@@ -353,6 +358,7 @@ def _outcome(
     gap: float,
     doubts: list[str],
     figures: dict[str, float],
+    crown_shares: list[tuple[tuple[float, ...], tuple[float, ...]]],
 ) -> ArchFit:
     """The fit in the terms of the contract."""
     adjusted, labelling = best.adjusted, best.labelling
@@ -371,6 +377,8 @@ def _outcome(
             role=_plain(labelling.roles[view]),
             upper=_teeth(0, labelling.labels[view][0]),
             lower=_teeth(1, labelling.labels[view][1]),
+            upper_doubts=crown_shares[view][0],
+            lower_doubts=crown_shares[view][1],
             error=float(np.median(errors[mine])) if mine.any() else float("inf"),
         )
     names = landmark_names()
@@ -389,6 +397,7 @@ def _outcome(
         doubts=tuple(doubts),
         scale_uncertainty=SCALE_UNCERTAINTY,
         figures=figures,
+        primary=labelling.primary,
     )
 
 

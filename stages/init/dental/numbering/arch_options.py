@@ -6,22 +6,6 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class ToothHint:
-    """The FDI number of one crown, as a person says it: "photo 0, point x, y = 16".
-
-    Attributes:
-        photo: index of the photograph, from 0, in the order given.
-        x, y: a point on the crown, pixels of the working image.
-        tooth: its FDI number (11-17, 21-27, 31-37, 41-47).
-    """
-
-    photo: int
-    x: float
-    y: float
-    tooth: int
-
-
-@dataclass(frozen=True)
 class ArchOptions:
     """Settings of `fit_arch`.
 
@@ -31,12 +15,12 @@ class ArchOptions:
 
     #: What each photograph is, in file order: `right`, `frontal`, `left` or `between`; None: found.
     order: tuple[str, ...] | None = None
-    #: Crowns whose FDI number is known.
-    labels: tuple[ToothHint, ...] = ()
     #: Focal length expected where it is unknown, as a multiple of the image's long side, and its
     #: relative standard deviation.
     focal_per_side: float = 1.9
     focal_deviation: float = 0.12
+    #: The same where photographs have been cropped: each has its own.
+    cropped_focal_deviation: float = 0.35
     #: Camera distance expected, and its relative standard deviation.
     distance: float = 125.0
     distance_deviation: float = 0.15
@@ -54,6 +38,10 @@ class ArchOptions:
     #: What it costs to call a tooth missing in all photographs, or a crown merged, split or none.
     missing_cost: float = 20.0
     defect_cost: float = 12.0
+    #: Weight of what the crowns look like beside where they lie.
+    looks_weight: float = 1.0
+    #: Labellings of a photograph's rows that look likeliest and are tried.
+    rows_tried: int = 40
     #: Labellings kept per photograph, and jointly, while searching.
     candidates_per_view: int = 10
     beam: int = 16

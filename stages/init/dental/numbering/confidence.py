@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.teeth import Dentition
+from stages.geometry.tooth_rows import NO_TOOTH
 from stages.init.dental.cameras.bundle import Adjusted, Sightings, view_angles
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.hypotheses import Scored, Scorer
-from stages.init.dental.numbering.sightings import NO_TOOTH
-from stages.init.dental.observation import Dentition
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.anatomy import is_upper
+from pipeline.artifacts.fdi import JAWS, is_upper
+from stages.geometry.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.hypotheses import (
@@ -22,11 +23,11 @@ from stages.init.dental.numbering.hypotheses import (
     contiguous,
     row_defects,
 )
-from stages.init.dental.numbering.sightings import JAWS, NO_TOOTH, Labels
 from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
 Array = npt.NDArray[np.float64]
 Fixed = dict[tuple[int, int, int], int]
+Doubts = tuple[float, ...]
 
 #: When one row's labels are tried against the arch of the other views, its landmarks may still be
 #: this far off (mm).
@@ -165,6 +166,28 @@ def without_view(scorer: Scorer, scored: Scored, number: int) -> Scored:
     cameras = scored.adjusted.unknowns[:-PER_ARCH].reshape(-1, PER_VIEW)[rest]
     unknowns = np.concatenate([cameras.ravel(), scored.adjusted.unknowns[-PER_ARCH:]])
     return scorer.solve(fewer, (unknowns, scored.adjusted.offsets), SEARCH_STEPS)
+
+
+def common_mouth(scorer: Scorer, scored: Scored) -> list[float]:
+    """Twice the log Bayes factor, view by view, that it shows the same mouth as the others.
+
+    The rival hypothesis is a mouth of its own: arch and landmarks are fitted to the view alone.
+    """
+    joint = scored.adjusted.evidence
+    result = []
+    for number, (view, role) in enumerate(
+        zip(scored.labelling.views, scored.labelling.roles, strict=True)
+    ):
+        rest = without_view(scorer, scored, number)
+        alone = replace(
+            scored.labelling, views=(view,), roles=(role,),
+            labels=(scored.labelling.labels[number],),
+        )  # fmt: skip
+        camera = scored.adjusted.unknowns[PER_VIEW * number : PER_VIEW * (number + 1)]
+        start = np.concatenate([camera, scored.adjusted.unknowns[-PER_ARCH:]])
+        own = scorer.solve(alone, (start, scored.adjusted.offsets), SEARCH_STEPS)
+        result.append(rest.adjusted.evidence + own.adjusted.evidence - joint)
+    return result
 
 
 def row_trial(
@@ -315,3 +338,38 @@ def margins(best: Scored, others: list[Scored]) -> tuple[float, float, float]:
         elif count:
             gaps[2].append(other.score - best.score)
     return min(gaps[0]), min(gaps[1]), min(gaps[2])
+
+
+def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubts]]:
+    """Probability, view by view and row by row, that each crown's label is another one.
+
+    Every labelling that was solved counts by its evidence; of equal ones the best counts.
+
+    Args:
+        best: the labelling chosen.
+        others: all others that were solved.
+    """
+    scores: dict[tuple[ViewLabels, ...], float] = {}
+    for scored in (best, *others):
+        if len(scored.labelling.labels) != len(best.labelling.labels):
+            continue
+        labels = scored.labelling.labels
+        scores[labels] = min(scores.get(labels, np.inf), scored.score)
+    least = min(scores.values())
+    weights = {labels: np.exp(-(score - least) / 2) for labels, score in scores.items()}
+    total = sum(weights.values())
+    result = []
+    for view, rows in enumerate(best.labelling.labels):
+        row_doubts = []
+        for jaw in (0, 1):
+            row_doubts.append(
+                tuple(
+                    float(
+                        sum(w for labels, w in weights.items() if labels[view][jaw][k] != label)
+                        / total
+                    )
+                    for k, label in enumerate(rows[jaw])
+                )
+            )
+        result.append((row_doubts[0], row_doubts[1]))
+    return result

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.anatomy import is_upper
+from pipeline.artifacts.fdi import is_upper
+from stages.geometry.tooth_rows import NO_TOOTH, Labels, best_rows
 from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
 from stages.init.dental.cameras.held import HeldCameras
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.sightings import NO_TOOTH, Labels, SeenRow, SightingCache
+from stages.init.dental.numbering.sightings import LOOKS, SeenRow, SightingCache
 from stages.init.dental.template import POSITIONS, position_of, textbook_arch
 
 Array = npt.NDArray[np.float64]
@@ -52,6 +53,7 @@ class Labelling:
         labels: (upper, lower) positions of the crowns of each.
         absent: FDI numbers of teeth that no photograph shows though their neighbours are shown.
         closed: those of them whose space the teeth behind have closed.
+        primary: permanent numbers in whose place primary teeth stand.
     """
 
     views: tuple[int, ...]
@@ -59,6 +61,7 @@ class Labelling:
     labels: tuple[ViewLabels, ...]
     absent: frozenset[int] = frozenset()
     closed: frozenset[int] = frozenset()
+    primary: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -116,8 +119,10 @@ class Scorer:
         options: ArchOptions,
         threads: int,
         held: HeldCameras | None = None,
+        primary: frozenset[int] = frozenset(),
     ) -> None:
         self.rows = rows
+        self.primary = primary
         self.held = held
         self.cache = SightingCache(rows)
         self.focals, self.focal_deviations = focals, focal_deviations
@@ -162,6 +167,9 @@ class Scorer:
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
             total += options.unused_cost * self.cache.unused(view, labels)
             total += options.defect_cost * sum(row_defects(labels[j], absent[j]) for j in (0, 1))
+            total += options.looks_weight * sum(
+                looks_cost(self.rows[view][j], labels[j]) for j in (0, 1)
+            )
         if len(self.rows) == 3 and options.order is None:
             total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
         return total
@@ -176,7 +184,7 @@ class Scorer:
         """Solve and score one labelling."""
         adjusted = adjust(
             self.cache.collect(list(labelling.views), list(labelling.labels)),
-            textbook_arch(labelling.closed),
+            textbook_arch(labelling.closed, labelling.primary),
             self.priors(labelling.views, labelling.roles),
             self.options.landmark_deviation,
             matches=matches,
@@ -210,22 +218,37 @@ def roles_of_view(view: int, views: int, options: ArchOptions) -> tuple[str, ...
     return MAIN_ROLES if views <= 3 else MAIN_ROLES + BETWEEN_ROLES
 
 
-def row_pairs(rows: tuple[SeenRow, SeenRow]) -> list[ViewLabels]:
-    """Labels of both rows of a view, without gaps, that anatomy allows."""
+def looks_cost(row: SeenRow, labels: Labels) -> float:
+    """Twice the negative log probability of a row's labels by the looks of its crowns."""
+    total = 0.0
+    for looks, score, label in zip(row.looks, row.scores, labels, strict=True):
+        # A crown that is hardly one may be none at less cost.
+        total -= float(looks[label]) if label != NO_TOOTH else -LOOKS.none * float(score)
+    return 2 * total
+
+
+def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
+    """The labels of both rows of a view that look likeliest and that anatomy allows."""
     upper, lower = rows
+    best = [best_rows(row.looks, count, LOOKS) for row in rows]
     pairs = []
-    n, m = len(upper), len(lower)
-    upper_x, lower_x = upper.middles[:, 0], lower.middles[:, 0]
-    left, right = max(upper_x[0], lower_x[0]), min(upper_x[-1], lower_x[-1])
+    for (cost, a), (other, b) in product(*best):
+        shift = _jaw_shift(upper, lower, a, b)
+        if shift is None or abs(shift) <= MAX_JAW_SHIFT:
+            pairs.append((cost + other, (a, b)))
+    return [labels for _, labels in sorted(pairs)[:count]]
+
+
+def _jaw_shift(upper: SeenRow, lower: SeenRow, a: Labels, b: Labels) -> float | None:
+    """By how many positions the upper row is ahead of the lower one where both are seen."""
+    known = [np.array([label != NO_TOOTH for label in labels], bool) for labels in (a, b)]
+    if min(k.sum() for k in known) < 2:
+        return None
+    x = [row.middles[k, 0] for row, k in zip((upper, lower), known, strict=True)]
+    at = [np.array(labels)[k] for labels, k in zip((a, b), known, strict=True)]
+    left, right = max(x[0][0], x[1][0]), min(x[0][-1], x[1][-1])
     across = np.linspace(left, right, 9) if right > left else np.array([(left + right) / 2])
-    upper_at = np.interp(across, upper_x, np.arange(n))
-    lower_at = np.interp(across, lower_x, np.arange(m))
-    for first_upper in range(-1, POSITIONS - n + 2):
-        for first_lower in range(-1, POSITIONS - m + 2):
-            shift = (first_upper + upper_at) - (first_lower + lower_at)
-            if abs(float(shift.mean())) <= MAX_JAW_SHIFT:
-                pairs.append((contiguous(first_upper, n), contiguous(first_lower, m)))
-    return pairs
+    return float((np.interp(across, x[0], at[0]) - np.interp(across, x[1], at[1])).mean())
 
 
 def view_candidates(
@@ -241,7 +264,7 @@ def view_candidates(
     """
     pairs = [
         labels
-        for labels in row_pairs(scorer.rows[view])
+        for labels in row_pairs(scorer.rows[view], scorer.options.rows_tried)
         if all(
             labels[jaw][crown] == position
             for (v, jaw, crown), position in fixed.items()
@@ -250,7 +273,10 @@ def view_candidates(
     ]
     kept: list[Scored] = []
     for role in roles:
-        jobs = [(Labelling((view,), (role,), (labels,)), None) for labels in pairs]
+        jobs = [
+            (Labelling((view,), (role,), (labels,), primary=scorer.primary), None)
+            for labels in pairs
+        ]
         solved = sorted(scorer.solve_all(list(jobs), VIEW_STEPS), key=_order)
         kept += solved[: scorer.options.candidates_per_view]
     kept.sort(key=_order)

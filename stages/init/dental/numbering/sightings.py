@@ -5,15 +5,17 @@ A label here is a position along the row, 0 (patient's right second molar) to 13
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.anatomy import Jaw
+from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.teeth import Crown, Dentition, Point
+from stages.geometry.tooth_rows import NO_TOOTH, ChainOptions, Labels, position_evidence
 from stages.init.dental.cameras.bundle import Sightings
-from stages.init.dental.observation import Dentition, Point
 from stages.init.dental.template import (
     EMBRASURE,
     PAPILLA,
@@ -24,10 +26,11 @@ from stages.init.dental.template import (
 )
 
 Array = npt.NDArray[np.float64]
-Labels = tuple[int, ...]
 
-NO_TOOTH = -1
-JAWS: tuple[Jaw, Jaw] = ("upper", "lower")
+#: How the looks of crowns count.
+LOOKS = ChainOptions()
+#: Log probability of a position where a person has said another.
+SAID_OTHERWISE = -60.0
 #: How well landmarks are found, as shares of the band of teeth (about 15 mm), across x along the
 #: row; a zenith or tip is in addition uncertain along the row by a share of its crown's width.
 ZENITH_DEVIATION, ZENITH_OF_WIDTH = (0.018, 0.018), 0.10
@@ -51,6 +54,8 @@ class SeenRow:
         zeniths, tips: [n, 2]; nan where not to be relied on.
         papillae_left, papillae_right, embrasures_left, embrasures_right: [n, 2]; nan where none.
         doubtful: [n] bool.
+        looks: [n, 14] log probability of each position by the crowns' looks.
+        scores: [n] 0..1, how sure it is that each is a crown.
     """
 
     jaw: Jaw
@@ -64,6 +69,8 @@ class SeenRow:
     embrasures_left: Array
     embrasures_right: Array
     doubtful: npt.NDArray[np.bool_]
+    looks: Array
+    scores: Array
 
     def __len__(self) -> int:
         return len(self.widths)
@@ -120,9 +127,24 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                 embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
                 embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
                 doubtful=doubtful,
+                looks=np.array([_evidence(crown, jaw) for crown in crowns]).reshape(-1, POSITIONS),
+                scores=np.array([crown.score for crown in crowns], np.float64),
             )
         )
     return rows[0], rows[1]
+
+
+def believed(crown: Crown) -> Mapping[int, float]:
+    """FDI number -> probability: by its looks, or what a person has said (doubt 0)."""
+    return {crown.number: 1.0} if crown.doubt == 0 and crown.number else crown.numbers
+
+
+def _evidence(crown: Crown, jaw: Jaw) -> Array:
+    """[14] log probability of each position; a person's word leaves no other."""
+    evidence = position_evidence(believed(crown), jaw, LOOKS)
+    if crown.doubt == 0 and crown.number:
+        evidence = np.where(evidence < evidence.max(), SAID_OTHERWISE, 0.0)
+    return np.asarray(evidence)
 
 
 def row_landmarks(

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RBFInterpolator
 
-from stages.init.dental.anatomy import Jaw, Landmark, teeth_of
+from pipeline.artifacts.fdi import Jaw, teeth_of
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.surface.chart import AXIS_DEPTH, ChartGrid, unroll
 
 Array32 = npt.NDArray[np.float32]

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from stages.init.dental.anatomy import Jaw
-from stages.init.dental.observation import Dentition
+from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.charts import (
     PAST_EDGE,

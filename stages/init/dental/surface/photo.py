@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.teeth import Dentition
 from stages.init.dense.appearance import highlights
-from stages.init.dental.anatomy import Jaw
-from stages.init.dental.observation import Dentition
 from stages.init.dental.solution import PlacedView
 
 Array32 = npt.NDArray[np.float32]

@@ -1,0 +1,216 @@
+// The page: photographs with crowns, the panel of the chosen crown, undo and saving.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const find = (id) => document.getElementById(id);
+const make = (tag, given = {}, ...inside) => {
+  const svg = ["svg", "g", "image", "polygon", "text", "line"].includes(tag);
+  const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag)
+    : document.createElement(tag);
+  for (const [name, value] of Object.entries(given)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value === true) made.setAttribute(name, "");
+    else if (value !== false && value !== null) made.setAttribute(name, value);
+  }
+  made.append(...inside.filter((child) => child !== null));
+  return made;
+};
+
+let nextId = 0;
+const withId = (crown) => ({ ...crown, id: nextId++ });
+const photos = data.photographs.map((photo) => ({
+  ...photo, crowns: photo.crowns.map(withId), entries: photo.earlier.crowns,
+  use: photo.earlier.use, kindSaid: photo.earlier.kind,
+}));
+const changing = ["crowns", "entries", "use", "kindSaid"];
+const past = [];
+let saved = yamlOf(photos);
+let savedOnce = false;
+let chosen = null; // { photo, id }
+let cut = null; // { from, to } while a crown is being split
+let typed = "";
+
+const chosenCrown = () => chosen?.photo.crowns.find((crown) => crown.id === chosen.id) ?? null;
+const say = (text, bad = false) => {
+  find("said").textContent = text;
+  find("said").classList.toggle("bad", bad);
+};
+
+// -- what can be done ------------------------------------------------------------------------------
+
+const change = (deed) => {
+  past.push({ state: photos.map((photo) => changing.map((name) => photo[name])), chosen });
+  deed();
+  cut = null;
+  find("next").hidden = true;
+  draw();
+};
+const undo = () => {
+  const before = past.pop();
+  if (!before) return;
+  photos.forEach((photo, k) => changing.forEach((name, n) => { photo[name] = before.state[k][n]; }));
+  [chosen, cut] = [before.chosen, null];
+  say("Undone.");
+  draw();
+};
+const put = (photo, crown, number) => {
+  // An earlier number of the same crown is replaced; a split before it stays.
+  photo.entries = photo.entries.filter((entry) => !entry.tooth || !contains(crown.outline,
+    entry.at.map((value, axis) => value / photo.scale[axis])));
+  photo.entries = [...photo.entries,
+    { at: original(photo, innerPoint(crown.outline)), tooth: number }];
+  photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
+    : { ...other, number, doubt: 0, said: true, jaw: jawOf(number) }));
+};
+const setNumber = (number) => {
+  const crown = chosenCrown();
+  if (!crown) return;
+  if (!isTooth(number)) {
+    say(`${number} is no FDI number: 11-18, 21-28, 31-38, 41-48; primary 51-55 to 81-85.`, true);
+    return;
+  }
+  change(() => put(chosen.photo, crown, number));
+  say(`${number}, ${nameOf(number)}.`);
+};
+const numberRow = () => {
+  const { photo } = chosen;
+  const row = rowOf(photo, chosenCrown().jaw);
+  const at = row.findIndex((crown) => crown.id === chosen.id);
+  let count = 0;
+  change(() => row.forEach((crown, k) => {
+    let stand = standing(row[at].number) + k - at;
+    if (Math.sign(stand) !== Math.sign(standing(row[at].number))) stand += Math.sign(k - at);
+    const primary = crown.number && isPrimary(crown.number) && Math.abs(stand) <= 5;
+    const number = numberAt(crown.jaw, stand, primary);
+    if (!isTooth(number) || (crown.number === number && crown.doubt === 0)) return;
+    put(photo, crown, number);
+    count += 1;
+  }));
+  say(`${count} more crowns numbered, from ${row[at].number} on to both sides.`);
+};
+const confirm = (photo) => {
+  change(() => photo.crowns.filter((crown) => crown.number && crown.doubt)
+    .forEach((crown) => put(photo, crown, crown.number)));
+  say(`The numbers in ${photo.name} are taken as certain.`);
+};
+const remove = () => {
+  const { photo } = chosen;
+  const crown = chosenCrown();
+  const row = rowOf(photo, crown.jaw);
+  const at = row.indexOf(crown);
+  change(() => {
+    photo.entries = [...photo.entries,
+      { at: original(photo, innerPoint(crown.outline)), remove: true }];
+    photo.crowns = photo.crowns.filter((other) => other !== crown);
+    const near = row[at + 1] ?? row[at - 1];
+    chosen = near ? { photo, id: near.id } : null;
+  });
+  say("Removed: it is no tooth.");
+};
+const startCut = () => {
+  const crown = chosenCrown();
+  const [x, y] = centreOf(crown.outline);
+  const [left, top, right, bottom] = extent(crown.outline);
+  const half = Math.hypot(right - left, bottom - top) * 0.55;
+  const [dx, dy] = [-Math.sin(chosen.photo.roll) * half, Math.cos(chosen.photo.roll) * half];
+  cut = { from: [x - dx, y - dy], to: [x + dx, y + dy], step: (right - left) / 30 };
+  say("Draw a line across the crown. Keys: arrows move it, Shift turns it, Enter cuts, Esc ends.");
+  draw();
+};
+const finishCut = () => {
+  const { photo } = chosen;
+  const crown = chosenCrown();
+  const parts = splitPolygon(crown.outline, cut.from, cut.to);
+  if (!parts) {
+    say("The line doesn't cross the crown; draw it from one side to the other.", true);
+    return;
+  }
+  const { from, to } = cut;
+  change(() => {
+    photo.entries = [...photo.entries, { at: original(photo, innerPoint(crown.outline)),
+      split: [original(photo, from), original(photo, to)] }];
+    const made = parts.map((outline) => withId({ ...crown, outline, number: 0, doubt: 1, said: false }));
+    photo.crowns = photo.crowns.flatMap((other) => (other === crown ? made : [other]));
+    chosen = { photo, id: rowOf(photo, crown.jaw).find((other) => made.includes(other)).id };
+  });
+  say("Split in two. Now number both.");
+};
+const moveCut = (key, turn) => {
+  const [sign, flat] = [["ArrowLeft", "ArrowUp"].includes(key) ? -1 : 1, key.match(/Left|Right/)];
+  const { from, to, step } = cut;
+  if (turn) {
+    const [x, y] = [(from[0] + to[0]) / 2, (from[1] + to[1]) / 2];
+    const [c, s] = [Math.cos(0.06 * sign), Math.sin(0.06 * sign)];
+    const around = ([u, v]) => [x + c * (u - x) - s * (v - y), y + s * (u - x) + c * (v - y)];
+    cut = { ...cut, from: around(from), to: around(to) };
+  } else {
+    const shifted = ([u, v]) => (flat ? [u + sign * step, v] : [u, v + sign * step]);
+    cut = { ...cut, from: shifted(from), to: shifted(to) };
+  }
+  draw();
+};
+const choose = (photo, id) => {
+  chosen = id === null ? null : { photo, id };
+  [cut, typed] = [null, ""];
+  say("");
+  draw();
+};
+const step = (key) => {
+  const { photo } = chosen;
+  const crown = chosenCrown();
+  const row = rowOf(photo, crown.jaw);
+  const at = row.indexOf(crown);
+  if (key === "ArrowLeft" || key === "ArrowRight") {
+    const next = row[at + (key === "ArrowLeft" ? -1 : 1)];
+    if (next) choose(photo, next.id);
+    return;
+  }
+  const other = rowOf(photo, crown.jaw === "upper" ? "lower" : "upper");
+  const here = along(photo, crown);
+  const near = other.reduce((best, candidate) => (best === null
+    || Math.abs(along(photo, candidate) - here) < Math.abs(along(photo, best) - here)
+    ? candidate : best), null);
+  if (near && (key === "ArrowUp") === (crown.jaw === "lower")) choose(photo, near.id);
+};
+
+// -- keys ------------------------------------------------------------------------------------------
+
+document.addEventListener("keydown", (event) => {
+  const writing = event.target.matches("input, select, textarea");
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !writing) {
+    event.preventDefault();
+    undo();
+    return;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey || !chosen || writing) return;
+  const inside = event.target.closest(".chip, #photographs") || event.target === document.body;
+  const { key } = event;
+  if (key === "Escape") {
+    if (cut) [cut] = [null];
+    else chosen = null;
+    say("");
+    draw();
+  } else if (!inside) {
+    return;
+  } else if (key.startsWith("Arrow")) {
+    if (cut) moveCut(key, event.shiftKey);
+    else step(key);
+  } else if (key === "Enter" && cut) {
+    finishCut();
+  } else if (/^[0-9]$/.test(key) && !cut) {
+    typed = (typed + key).slice(-2);
+    if (typed.length === 2) {
+      setNumber(Number(typed));
+      typed = "";
+    } else {
+      say(`${typed}_`);
+    }
+  } else if ((key === "Delete" || key === "Backspace") && !cut) {
+    remove();
+  } else if (key.toLowerCase() === "s" && !cut) {
+    startCut();
+  } else {
+    return;
+  }
+  event.preventDefault();
+});
+{% include "check_view.js" %}

@@ -1,0 +1,326 @@
+"""From the outlines of crowns in a photograph to a dentition: order, directions, landmarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.teeth import Crown, Dentition
+
+Array = npt.NDArray[np.float64]
+
+#: A row of teeth that lies this flat is not turned (radians): a view from above or below tilts it
+#: as much.
+NATURAL_TILT = math.radians(5)
+#: Shares of the band's height within which the gum line or biting edge counts as its extremum: the
+#: landmark is the middle of that stretch, for crowns end flat.
+ZENITH_FLATNESS, TIP_FLATNESS, PARTING_FLATNESS = 0.035, 0.03, 0.015
+#: Neighbours further apart than this share of the narrower one's width have no papilla in common.
+GAP = 0.2
+#: A crown nearer to the border of the photograph than this share of its size goes on outside.
+BORDER = 0.008
+#: Crowns scoring less are doubtful.
+SURE_SCORE = 0.5
+#: Distance between the points of an outline from which landmarks are taken, as share of the band.
+SAMPLING = 0.004
+
+
+@dataclass(frozen=True)
+class Outline:
+    """One crown's outline in a photograph, before its landmarks are known.
+
+    Attributes:
+        polygon: [K, 2] pixels of the working image, pixel centres at .5.
+        jaw: upper or lower.
+        score: 0..1, how sure it is that this is one crown.
+        numbers: FDI number -> probability by its looks.
+        number, doubt: as in `Crown`.
+    """
+
+    polygon: Array
+    jaw: Jaw
+    score: float = 1.0
+    numbers: Mapping[int, float] = field(default_factory=dict)
+    number: int = 0
+    doubt: float = 1.0
+
+
+def outline_of(crown: Crown) -> Outline:
+    """What a crown is without its landmarks."""
+    return Outline(crown.outline, crown.jaw, crown.score, crown.numbers, crown.number, crown.doubt)
+
+
+def dentition_of(
+    outlines: Sequence[Outline],
+    name: str,
+    size: tuple[int, int],
+    kind: str,
+    roll: float | None = None,
+    set_aside: str = "",
+    doubts: tuple[str, ...] = (),
+) -> Dentition:
+    """Put the crowns of a photograph in order and find their landmarks.
+
+    Args:
+        outlines: of the crowns.
+        name, size, kind, set_aside, doubts: as in `Dentition`.
+        roll: radians by which the rows are turned clockwise; None: found from the outlines.
+    """
+    good = [outline for outline in outlines if len(outline.polygon) >= 3]
+    base = Dentition(name, size, kind, set_aside=set_aside, doubts=doubts)
+    if not good:
+        return base
+    turn = row_roll(good) if roll is None else roll
+    upright = [replace(o, polygon=_turned(o.polygon, -turn)) for o in good]
+    rows: dict[Jaw, list[int]] = {}
+    for jaw in JAWS:
+        mine = [k for k, outline in enumerate(upright) if outline.jaw == jaw]
+        rows[jaw] = sorted(mine, key=lambda k: float(centroid(upright[k].polygon)[0]))
+    band = _band_height([upright[k] for k in rows["upper"]], [upright[k] for k in rows["lower"]])
+    made: dict[Jaw, tuple[Crown, ...]] = {}
+    for jaw in JAWS:
+        crowns = _row([upright[k] for k in rows[jaw]], jaw, band)
+        made[jaw] = tuple(
+            _turned_crown(crown, good[k], turn, size)
+            for crown, k in zip(crowns, rows[jaw], strict=True)
+        )
+    return replace(
+        base,
+        upper=made["upper"],
+        lower=made["lower"],
+        roll=turn,
+        band_height=band,
+        jaws_apart=_jaws_apart(upright, rows, band),
+    )
+
+
+def centroid(polygon: Array) -> Array:
+    """[2] centre of the area of a polygon [K, 2]."""
+    x, y = polygon.T
+    x2, y2 = np.roll(x, -1), np.roll(y, -1)
+    cross = x * y2 - x2 * y
+    area = float(cross.sum())
+    if abs(area) < 1e-9:
+        return np.asarray(polygon.mean(axis=0))
+    return np.array([((x + x2) * cross).sum(), ((y + y2) * cross).sum()]) / (3 * area)
+
+
+def row_roll(outlines: Sequence[Outline]) -> float:
+    """Radians by which the rows of teeth are turned clockwise; upper teeth end up on top."""
+    centres = np.array([centroid(outline.polygon) for outline in outlines])
+    upper = np.array([outline.jaw == "upper" for outline in outlines])
+    rows = [centres[side] - centres[side].mean(axis=0) for side in (upper, ~upper) if side.any()]
+    spread = sum((row.T @ row for row in rows), start=np.zeros((2, 2)))
+    angle = 0.5 * math.atan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1])
+    if upper.any() and not upper.all():
+        up = centres[upper].mean(axis=0) - centres[~upper].mean(axis=0)
+        if up @ [math.sin(angle), -math.cos(angle)] < 0:
+            angle += math.pi if angle <= 0 else -math.pi
+    return 0.0 if abs(angle) < NATURAL_TILT else angle
+
+
+def _turned(points: Array, angle: float) -> Array:
+    """[N, 2] points turned clockwise (y down) by an angle about the origin."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]))
+
+
+def _band_height(upper: list[Outline], lower: list[Outline]) -> float:
+    """Pixels from gum line to gum line with the jaws closed, from upright outlines."""
+    if upper and lower:
+        tops = np.array([[centroid(o.polygon)[0], o.polygon[:, 1].min()] for o in upper])
+        ends = np.array([[centroid(o.polygon)[0], o.polygon[:, 1].max()] for o in lower])
+        there = np.interp(tops[:, 0], ends[:, 0], ends[:, 1])
+        inside = (tops[:, 0] >= ends[0, 0]) & (tops[:, 0] <= ends[-1, 0])
+        band = float(np.median((there - tops[:, 1])[inside if inside.any() else slice(None)]))
+    else:
+        band = 0.0
+    heights = [
+        float(np.median([np.ptp(o.polygon[:, 1]) for o in row])) for row in (upper, lower) if row
+    ]
+    most = sum(heights) if len(heights) == 2 else 1.8 * heights[0]
+    # Jaws that are apart show a higher band; two rows never overlap by more than one crown.
+    return float(np.clip(band, max(heights), most)) if band else most
+
+
+def _jaws_apart(outlines: list[Outline], rows: dict[Jaw, list[int]], band: float) -> float:
+    """Share of the band between the biting edges where they are nearest; 0: in contact."""
+    upper = [outlines[k].polygon for k in rows["upper"]]
+    lower = [outlines[k].polygon for k in rows["lower"]]
+    if not upper or not lower:
+        return 0.0
+    gaps = []
+    for polygon in upper:
+        middle = float(centroid(polygon)[0])
+        below = [p for p in lower if p[:, 0].min() <= middle <= p[:, 0].max()]
+        if below:
+            edge = min(float(p[:, 1].min()) for p in below)
+            gaps.append((edge - float(polygon[:, 1].max())) / band)
+    return max(0.0, float(np.quantile(gaps, 0.25))) if gaps else 0.0
+
+
+@dataclass(frozen=True)
+class _Local:
+    """A crown's outline in directions of its row: [N] along it and [N] towards the gum."""
+
+    along: Array
+    gum: Array
+
+
+def _resampled(polygon: Array, step: float) -> Array:
+    """[N, 2] points on a polygon's sides, no further apart than step."""
+    after = np.roll(polygon, -1, axis=0)
+    lengths = np.linalg.norm(after - polygon, axis=1)
+    parts = [
+        a + np.linspace(0, 1, max(1, math.ceil(length / step)), endpoint=False)[:, None] * (b - a)
+        for a, b, length in zip(polygon, after, lengths, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def _directions(centres: Array, jaw: Jaw) -> list[tuple[Array, Array]]:
+    """Unit vectors along the row and towards the gum at each crown, from its neighbours."""
+    count = len(centres)
+    result = []
+    for k in range(count):
+        first, last = max(0, k - 1), min(count - 1, k + 1)
+        step = centres[last] - centres[first]
+        # Steep steps come of displaced crowns, not of the row.
+        slope = float(np.clip(step[1] / max(step[0], 1e-6), -0.7, 0.7)) if count > 1 else 0.0
+        along = np.array([1.0, slope]) / math.hypot(1.0, slope)
+        result.append((along, _gumward(along, jaw)))
+    return result
+
+
+def _gumward(along: Array, jaw: Jaw) -> Array:
+    """The direction towards the gum beside a direction along the row (left to right, y down)."""
+    up = np.array([along[1], -along[0]])
+    return up if jaw == "upper" else -up
+
+
+def _extreme(local: _Local, flatness: float, towards_gum: bool) -> tuple[float, float]:
+    """(along, gumward) of the middle of the outermost stretch of an outline."""
+    height = local.gum if towards_gum else -local.gum
+    top = float(height.max())
+    stretch = local.along[height >= top - flatness]
+    return float((stretch.min() + stretch.max()) / 2), top if towards_gum else -top
+
+
+def _envelope(local: _Local, at: Array, outer: bool) -> Array:
+    """Largest (or smallest) gumward coordinate of an outline at places along the row; nan outside.
+
+    `at` is evenly spaced; the outline's points lie closer together than that.
+    """
+    sign = 1.0 if outer else -1.0
+    step = float(at[1] - at[0])
+    bins = np.floor((local.along - at[0]) / step + 0.5).astype(np.int64)
+    inside = (bins >= 0) & (bins < len(at))
+    result = np.full(len(at), -np.inf)
+    np.maximum.at(result, bins[inside], sign * local.gum[inside])
+    return np.where(np.isfinite(result), sign * result, np.nan)
+
+
+def _parting(
+    first: Array, second: Array, along: Array, gumward: Array, band: float, at_gum: bool
+) -> Array | None:
+    """Where two neighbours part at the gum (papilla) or the biting edge (embrasure).
+
+    Args:
+        first, second: [N, 2] points on their outlines, left and right.
+        along, gumward: directions there.
+    """
+    locals_ = [_Local(points @ along, points @ gumward) for points in (first, second)]
+    flatness = ZENITH_FLATNESS if at_gum else TIP_FLATNESS
+    start, end = (_extreme(local, flatness * band, at_gum)[0] for local in locals_)
+    step = max(SAMPLING * band * 1.5, 0.4)
+    if end - start < 4 * step:
+        return None
+    at = np.arange(start, end, step)
+    with np.errstate(invalid="ignore"):
+        profiles = np.stack([_envelope(local, at, at_gum) for local in locals_])
+        sign = 1.0 if at_gum else -1.0
+        line = np.nanmax(np.where(np.isnan(profiles), -np.inf, sign * profiles), axis=0)
+    known = np.isfinite(line)
+    if known.sum() < 4:
+        return None
+    lowest = float(line[known].min())
+    stretch = at[known & (line <= lowest + PARTING_FLATNESS * band)]
+    place = float((stretch.min() + stretch.max()) / 2)
+    return np.asarray(place * along + sign * lowest * gumward)
+
+
+def _row(outlines: list[Outline], jaw: Jaw, band: float) -> list[Crown]:
+    """Crowns with landmarks, in the upright frame, of outlines from left to right."""
+    if not outlines:
+        return []
+    points = [_resampled(o.polygon, max(SAMPLING * band, 0.25)) for o in outlines]
+    centres = np.array([centroid(outline.polygon) for outline in outlines])
+    directions = _directions(centres, jaw)
+    partings: list[tuple[Array | None, Array | None]] = []
+    for k, (before, after) in enumerate(pairwise(points)):
+        width = min(np.ptp(before[:, 0]), np.ptp(after[:, 0]))
+        apart = float(after[:, 0].min() - before[:, 0].max())
+        if apart > GAP * width:
+            partings.append((None, None))
+            continue
+        along = directions[k][0] + directions[k + 1][0]
+        along /= np.linalg.norm(along)
+        gumward = _gumward(along, jaw)
+        papilla, embrasure = (
+            _parting(before, after, along, gumward, band, at_gum) for at_gum in (True, False)
+        )
+        partings.append((papilla, embrasure))
+    crowns = []
+    none = (None, None)
+    for k, outline in enumerate(outlines):
+        along, gumward = directions[k]
+        local = _Local(points[k] @ along, points[k] @ gumward)
+        zenith = _extreme(local, ZENITH_FLATNESS * band, True)
+        tip = _extreme(local, TIP_FLATNESS * band, False)
+        left = partings[k - 1] if k > 0 else none
+        right = partings[k] if k < len(partings) else none
+        crowns.append(
+            Crown(
+                jaw=jaw,
+                zenith=zenith[0] * along + zenith[1] * gumward,
+                tip=tip[0] * along + tip[1] * gumward,
+                papilla_left=left[0], papilla_right=right[0],
+                embrasure_left=left[1], embrasure_right=right[1],
+                width=float(np.ptp(local.along)),
+                height=max(float(np.ptp(local.gum)), 1.0),
+                cut_left=k == 0, cut_right=k == len(outlines) - 1,
+                score=outline.score, numbers=outline.numbers,
+                number=outline.number, doubt=outline.doubt,
+            )
+        )  # fmt: skip
+    return crowns
+
+
+def _turned_crown(crown: Crown, outline: Outline, turn: float, size: tuple[int, int]) -> Crown:
+    """A crown of the upright frame in the photograph as it is."""
+
+    def back(point: Array | None) -> Array | None:
+        return None if point is None else _turned(point[None], turn)[0]
+
+    zenith, tip = back(crown.zenith), back(crown.tip)
+    assert zenith is not None and tip is not None
+    low, high = outline.polygon.min(axis=0), outline.polygon.max(axis=0)
+    margin = BORDER * max(size)
+    cut = bool((low < margin).any() or (high > np.array(size) - margin).any())
+    return replace(
+        crown,
+        zenith=zenith,
+        tip=tip,
+        papilla_left=back(crown.papilla_left),
+        papilla_right=back(crown.papilla_right),
+        embrasure_left=back(crown.embrasure_left),
+        embrasure_right=back(crown.embrasure_right),
+        outline=outline.polygon,
+        doubtful=cut or outline.score < SURE_SCORE,
+    )

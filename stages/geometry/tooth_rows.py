@@ -1,0 +1,121 @@
+"""The order of the teeth along a row, as a hidden Markov chain.
+
+Crowns come from left to right. A crown's looks are the evidence; from one crown to the next the
+position grows by one, more where a tooth is missing or was not found; a crown may be none at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.fdi import Jaw, permanent_of, teeth_of
+
+Array = npt.NDArray[np.float64]
+Labels = tuple[int, ...]
+
+#: Positions along a row, patient's right to left, and the label of a crown that is no tooth.
+POSITIONS = 14
+NO_TOOTH = -1
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Settings of `row_probabilities`. Costs are negative log probabilities.
+
+    Attributes:
+        temper: evidence of a crown's looks counts this much, for its pixels err together.
+        floor: least probability of any position by looks.
+        skipped: cost of each position passed over between two crowns, next to each other or apart.
+        none: cost of a crown that is no tooth of the row.
+    """
+
+    temper: float = 1.0
+    floor: float = 2e-3
+    skipped: float = 3.0
+    none: float = 4.5
+
+
+def position_evidence(numbers: Mapping[int, float], jaw: Jaw, options: ChainOptions) -> Array:
+    """[14] log probability of each position along the row by a crown's looks."""
+    order = teeth_of(jaw)
+    share = np.zeros(POSITIONS)
+    for tooth, probability in numbers.items():
+        if permanent_of(tooth) in order:
+            share[order.index(permanent_of(tooth))] += probability
+    if share.sum() <= 0:
+        share[:] = 1.0
+    share = share / share.sum()
+    share = share**options.temper
+    return np.asarray(np.log((1 - options.floor * POSITIONS) * share / share.sum() + options.floor))
+
+
+def row_probabilities(evidence: Array, options: ChainOptions) -> tuple[Array, float]:
+    """Probabilities of each crown's position in its row.
+
+    Args:
+        evidence: [n, 14] log probability of each position by looks, crowns from left to right.
+
+    Returns:
+        [n, 15] probabilities of the positions and (last) of being no tooth of this row; and the
+        log probability of the row.
+    """
+    count = len(evidence)
+    if count == 0:
+        return np.zeros((0, POSITIONS + 1)), 0.0
+    # A state is the last position taken, 0: none yet; p + 1: position p.
+    states = POSITIONS + 1
+    step = np.full((states, states), -np.inf)
+    for a in range(states):
+        for b in range(a + 1, states):
+            step[a, b] = 0.0 if a == 0 else -options.skipped * (b - a - 1)
+    stay = -options.none - np.log(POSITIONS)
+    forward = np.full((count + 1, states), -np.inf)
+    forward[0, 0] = 0.0
+    for k in range(count):
+        moved = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)
+        moved[1:] += evidence[k]
+        forward[k + 1] = np.logaddexp(moved, forward[k] + stay)
+    backward = np.zeros((count + 1, states))
+    for k in range(count - 1, -1, -1):
+        ahead = backward[k + 1].copy()
+        ahead[1:] += evidence[k]
+        taken = np.logaddexp.reduce(step + ahead[None], axis=1)
+        backward[k] = np.logaddexp(taken, backward[k + 1] + stay)
+    total = float(backward[0, 0])
+    result = np.zeros((count, POSITIONS + 1))
+    for k in range(count):
+        arrive = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)[1:]
+        result[k, :POSITIONS] = np.exp(arrive + evidence[k] + backward[k + 1][1:] - total)
+        result[k, POSITIONS] = np.exp(
+            np.logaddexp.reduce(forward[k] + stay + backward[k + 1]) - total
+        )
+    return result, total
+
+
+def best_rows(evidence: Array, count: int, options: ChainOptions) -> list[tuple[float, Labels]]:
+    """The most probable labellings of a row, best first.
+
+    Args:
+        evidence: [n, 14] as for `row_probabilities`.
+        count: how many at most.
+
+    Returns:
+        (cost, labels): cost is the negative log probability; a label is a position or `NO_TOOTH`.
+    """
+    none = options.none + float(np.log(POSITIONS))
+    partial: dict[int, list[tuple[float, Labels]]] = {-1: [(0.0, ())]}
+    for crown in evidence:
+        following: dict[int, list[tuple[float, Labels]]] = {}
+        for last, rows in partial.items():
+            for cost, labels in rows:
+                following.setdefault(last, []).append((cost + none, (*labels, NO_TOOTH)))
+                for position in range(last + 1, POSITIONS):
+                    skipped = 0 if last < 0 else position - last - 1
+                    more = cost + options.skipped * skipped - float(crown[position])
+                    following.setdefault(position, []).append((more, (*labels, position)))
+        partial = {last: sorted(rows)[:count] for last, rows in following.items()}
+    return sorted(row for rows in partial.values() for row in rows)[:count]

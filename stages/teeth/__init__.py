@@ -1,0 +1,1 @@
+"""Each photograph by itself: what it shows, which pixels are teeth, the crowns, their numbers."""

@@ -1,0 +1,136 @@
+"""Which photographs take part: the right ones of a clinic's whole folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.teeth import Dentition
+from stages.teeth.read import Reading, row_extent
+
+Array32 = npt.NDArray[np.float32]
+
+#: Words for the kinds that are set aside.
+_OCCLUSAL = {"upper": "the biting surfaces of the upper jaw", "lower": "those of the lower jaw"}
+#: Photographs are compared in numbers that so many crowns have in common.
+_COMMON_CROWNS = 5
+#: Long side to which sharpness is compared.
+_SHARPNESS_SIDE = 512
+
+
+@dataclass(frozen=True)
+class ChoiceOptions:
+    """Settings of `choose`, as in `config.TeethConfig`."""
+
+    least_crowns: int = 5
+    least_extent: float = 0.3
+    least_colour: float = 4.0
+    same_view: float = 0.06
+    apart_gap: float = 0.08
+    apart_sure: float = 0.5
+
+
+def choose(
+    readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
+    options: ChoiceOptions,
+) -> list[Dentition]:  # fmt: skip
+    """Set aside, with a reason each, the photographs that tell nothing of the closed bite.
+
+    Args:
+        readings: of the photographs.
+        images: [H, W, 3] float32 sRGB in 0..1 of each.
+        names: how the user knows them.
+
+    Returns:
+        The dentitions, `set_aside` filled in.
+    """
+    reasons = [
+        _unusable(reading, image, options) for reading, image in zip(readings, images, strict=True)
+    ]
+    for k, reason in _repeated(readings, images, names, reasons, options).items():
+        reasons[k] = reason
+    return [
+        replace(reading.dentition, set_aside=reason)
+        for reading, reason in zip(readings, reasons, strict=True)
+    ]
+
+
+def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
+    """Why a photograph by itself can't be used; empty: it can."""
+    dentition = reading.dentition
+    if chroma(image) < options.least_colour:
+        return "it has no colour: an X-ray, or not a photograph"
+    if len(dentition.all_crowns) < options.least_crowns:
+        return f"no row of teeth was found in it ({len(dentition.all_crowns)} crowns)"
+    if row_extent(dentition) < options.least_extent:
+        return "the teeth are too small in it: a face, or taken from too far away"
+    occlusal = {kind: reading.kinds[kind] for kind in _OCCLUSAL}
+    likely = max(occlusal, key=lambda kind: occlusal[kind])
+    rows = (len(dentition.upper), len(dentition.lower))
+    if occlusal[likely] > 0.5:
+        return f"it shows {_OCCLUSAL[likely]}"
+    if min(rows) <= 1 and max(rows) >= options.least_crowns and reading.kinds["other"] > 0.5:
+        return "it shows one jaw only"
+    gap = dentition.jaws_apart
+    if gap > 2 * options.apart_gap or (
+        gap > options.apart_gap and reading.apart > options.apart_sure
+    ):
+        return "the jaws are apart in it"
+    return ""
+
+
+def chroma(image: Array32) -> float:
+    """Mean distance of a picture's colours from grey (CIE ab)."""
+    small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA)
+    lab = cv2.cvtColor(np.clip(small, 0, 1), cv2.COLOR_RGB2Lab)
+    return float(np.linalg.norm(lab[..., 1:], axis=-1).mean())
+
+
+def _repeated(
+    readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
+    reasons: Sequence[str], options: ChoiceOptions,
+) -> dict[int, str]:  # fmt: skip
+    """Photographs that show what a better one shows too -> why they are set aside."""
+    usable = [k for k, reason in enumerate(reasons) if not reason]
+    worth = {k: _worth(readings[k], images[k]) for k in usable}
+    result: dict[int, str] = {}
+    for k in sorted(usable, key=lambda k: -worth[k]):
+        for other in sorted(usable, key=lambda k: -worth[k]):
+            if other == k:
+                break
+            if other in result:
+                continue
+            off = layout_distance(readings[k].dentition, readings[other].dentition)
+            if off is not None and off < options.same_view:
+                result[k] = f"it shows the same as {names[other]}, which is clearer"
+                break
+    return result
+
+
+def _worth(reading: Reading, image: Array32) -> float:
+    """How much a photograph tells: crowns found surely; then sharpness."""
+    crowns = sum(c.score * (1 - c.doubt) for c in reading.dentition.all_crowns)
+    scale = _SHARPNESS_SIDE / max(image.shape[:2])
+    grey = cv2.cvtColor(cv2.resize(image, None, fx=scale, fy=scale), cv2.COLOR_RGB2GRAY)
+    sharpness = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)).mean())
+    return crowns + 10 * sharpness
+
+
+def layout_distance(a: Dentition, b: Dentition) -> float | None:
+    """How differently two photographs show the same crowns: RMS over the row's width, after a
+    similarity transform; None where they have too few numbers in common."""
+    first = {crown.number: crown.centre for crown in a.all_crowns if crown.number}
+    second = {crown.number: crown.centre for crown in b.all_crowns if crown.number}
+    common = sorted(set(first) & set(second))
+    if len(common) < max(_COMMON_CROWNS, 0.6 * min(len(first), len(second))):
+        return None
+    p = np.array([complex(*first[tooth]) for tooth in common])
+    q = np.array([complex(*second[tooth]) for tooth in common])
+    p, q = p - p.mean(), q - q.mean()
+    factor = (np.conj(p) @ q) / max(float((np.abs(p) ** 2).sum()), 1e-9)
+    residual = np.sqrt((np.abs(factor * p - q) ** 2).mean())
+    return float(residual / max(np.abs(q).max() * 2, 1e-9))

@@ -1,0 +1,43 @@
+"""Settings of the stage `teeth`. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipeline.stage import StageConfig
+
+
+class TeethConfig(StageConfig):
+    """How photographs are read."""
+
+    method: Literal["auto", "reader", "none"] = Field(
+        "auto",
+        description="reader: read every photograph; none: none; auto: read up to `most_views`, and "
+        "leave scenes alone whose first photographs show no teeth",
+    )
+    most_views: int = Field(
+        12, ge=1, le=1000, description="with more photographs than this, auto reads none"
+    )
+    set_aside: bool = Field(
+        True,
+        description="leave out what is no photograph of closed teeth from the front or side: "
+        "occlusal views, open mouths, faces, X-rays, what is shown twice",
+    )
+    least_crowns: int = Field(
+        5, ge=2, le=32, description="with fewer crowns a photograph shows no row of teeth"
+    )
+    least_extent: float = Field(
+        0.3, ge=0, le=1,
+        description="a row of teeth narrower than this, over the photograph's long side, is a face",
+    )  # fmt: skip
+    least_colour: float = Field(
+        4.0, ge=0, le=100,
+        description="mean chroma (CIE ab) below which a photograph is an X-ray or not in colour",
+    )  # fmt: skip
+    same_view: float = Field(
+        0.06, ge=0, le=1,
+        description="two photographs whose crowns lie this near each other after a similarity "
+        "transform, over the width of their rows, show the same",
+    )  # fmt: skip

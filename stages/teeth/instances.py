@@ -1,0 +1,212 @@
+"""From the network's maps to single crowns: where one ends and the next begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from stages.teeth.network import Answer
+
+Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int32]
+Map = npt.NDArray[np.float32]
+
+_NEIGHBOURS = [(0, 0)] + [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+#: The maps are brought to this many times their size first.
+_FINER = 2
+#: Standard deviation of the blur before peaks are sought, pixels of the finer maps.
+SMOOTHING = 1.2
+#: A crown's middle is a peak of the distance to its border of at least this height...
+LEAST_PEAK = 0.35
+#: ... and two peaks are of one crown if the ridge between them is this share of the lower peak.
+MERGING_RIDGE = 0.82
+#: A border between two crowns is a valley of this depth (share of the height).
+BORDER_DEPTH = 0.8
+#: Crowns smaller than this share of the median one (area) are none.
+LEAST_AREA = 0.06
+#: Pixels of the finer maps, too.
+LEAST_PIXELS = 40
+#: Finer grid on which an outline is drawn.
+_OUTLINE_SCALE = 3
+#: Outlines are thinned to this many pixels of the finer maps.
+_OUTLINE_TOLERANCE = 0.2
+
+
+@dataclass(frozen=True)
+class Found:
+    """A crown in the network's frame, before anything is made of it.
+
+    Attributes:
+        polygon: [K, 2] pixels of the photograph.
+        score: 0..1.
+        area: pixels of the photograph.
+        lower, left, primary: logits.
+        position: [8] log probabilities of the place in the quadrant.
+    """
+
+    polygon: Array
+    score: float
+    area: float
+    lower: float
+    left: float
+    primary: float
+    position: Array
+
+
+def find_crowns(answer: Answer) -> list[Found]:
+    """The crowns in a photograph, largest first."""
+    size = (answer.tooth.shape[1] * _FINER, answer.tooth.shape[0] * _FINER)
+    tooth = cv2.resize(answer.tooth, size, interpolation=cv2.INTER_LINEAR)
+    parted = answer.inside * (1 - BORDER_DEPTH * answer.border)
+    inside = np.asarray(cv2.resize(parted, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    mask = tooth > 0
+    labels = _watershed(inside, mask)
+    count = int(labels.max())
+    if count == 0:
+        return []
+    numbers = np.arange(1, count + 1)
+    areas = ndimage.sum_labels(np.ones_like(tooth), labels, numbers)
+    boxes = ndimage.find_objects(labels)
+    share = 1 / (1 + np.exp(-tooth.astype(np.float64)))
+    linear = answer.answer_from_image
+    scale2 = abs(float(np.linalg.det(linear[:, :2]))) * _FINER**2
+    small = labels[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER]
+    typical = float(np.median(areas))
+    crowns = []
+    for number in numbers:
+        area = float(areas[number - 1])
+        if area < max(LEAST_PIXELS, LEAST_AREA * typical):
+            continue
+        mine = labels[boxes[number - 1]] == number
+        part = share[boxes[number - 1]]
+        polygon = _outline(mine, part)
+        own = small == number
+        if polygon is None or not own.any():
+            continue
+        corner = [boxes[number - 1][1].start, boxes[number - 1][0].start]
+        weight = answer.inside * own
+        weight = weight / max(float(weight.sum()), 1e-9)
+        peak = float(inside[boxes[number - 1]][mine].max())
+        crowns.append(
+            Found(
+                polygon=_to_image((polygon + corner) / _FINER, linear),
+                score=float(part[mine].mean()) * min(1.0, peak / 0.8),
+                area=area / scale2,
+                lower=float((answer.lower * weight).sum()),
+                left=float((answer.left * weight).sum()),
+                primary=float((answer.primary * weight).sum()),
+                position=np.asarray((answer.position * weight).sum(axis=(1, 2)), np.float64),
+            )
+        )
+    return sorted(crowns, key=lambda crown: -crown.area)
+
+
+def _watershed(inside: Map, mask: npt.NDArray[np.bool_]) -> Labels:
+    """[H, W] number of the crown that each pixel of the mask belongs to, 0: none.
+
+    From every pixel the steepest way up ends on a peak: a region for each peak. Regions between
+    which there is no valley become one.
+    """
+    smooth = np.asarray(cv2.GaussianBlur(inside, (0, 0), SMOOTHING), np.float32)
+    # Where the map is flat the way leads away from the border.
+    depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    height = np.where(mask, smooth + np.float32(1e-4) * depth, -1).astype(np.float32)
+    rows, columns = mask.shape
+    padded = np.pad(height, 1, constant_values=-1)
+    around = np.stack(
+        [padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns] for i, j in _NEIGHBOURS]
+    )
+    step = np.array([i * columns + j for i, j in _NEIGHBOURS])
+    parent = (np.arange(mask.size) + step[around.argmax(axis=0)].ravel()).astype(np.int64)
+    parent[~mask.ravel()] = np.flatnonzero(~mask.ravel())
+    while True:
+        further = parent[parent]
+        if np.array_equal(further, parent):
+            break
+        parent = further
+    _, regions = np.unique(np.where(mask.ravel(), parent, -1), return_inverse=True)
+    labels = regions.reshape(mask.shape).astype(np.int32)
+    if mask.all():
+        labels += 1
+    owner = _merged(labels, smooth, int(labels.max()))
+    return _largest_pieces(np.asarray(owner[labels], np.int32))
+
+
+def _merged(labels: Labels, smooth: Map, count: int) -> Labels:
+    """[count + 1] number of each region once those without a valley between them are one."""
+    peak = np.zeros(count + 1)
+    peak[1:] = ndimage.maximum(smooth, labels, np.arange(1, count + 1))
+    first, second, ridge = [], [], []
+    for a, b, low in (
+        (labels[:-1], labels[1:], np.minimum(smooth[:-1], smooth[1:])),
+        (labels[:, :-1], labels[:, 1:], np.minimum(smooth[:, :-1], smooth[:, 1:])),
+    ):
+        touch = (a != b) & (a > 0) & (b > 0)
+        first.append(np.minimum(a[touch], b[touch]))
+        second.append(np.maximum(a[touch], b[touch]))
+        ridge.append(low[touch])
+    pairs = np.concatenate(first).astype(np.int64) * (count + 1) + np.concatenate(second)
+    heights = np.concatenate(ridge)
+    unique, which = np.unique(pairs, return_inverse=True)
+    highest = np.zeros(len(unique))
+    np.maximum.at(highest, which, heights)
+    owner = np.arange(count + 1, dtype=np.int32)
+    for k in np.argsort(-highest, kind="stable"):
+        i, j = int(owner[unique[k] // (count + 1)]), int(owner[unique[k] % (count + 1)])
+        if i == j:
+            continue
+        lower = min(peak[i], peak[j])
+        if lower < LEAST_PEAK or highest[k] > MERGING_RIDGE * lower:
+            keep, drop = (i, j) if peak[i] >= peak[j] else (j, i)
+            owner[owner == drop] = keep
+    owner[peak[owner] < LEAST_PEAK] = 0
+    return owner
+
+
+def _largest_pieces(labels: Labels) -> Labels:
+    """Numbers 1..n; of each region its largest connected piece."""
+    result = np.zeros_like(labels)
+    number = 0
+    for value in np.unique(labels):
+        if value == 0:
+            continue
+        pieces, count = ndimage.label(labels == value)
+        sizes = np.bincount(pieces.ravel())[1:]
+        if count:
+            number += 1
+            result[pieces == 1 + int(np.argmax(sizes))] = number
+    return result
+
+
+def _outline(mine: npt.NDArray[np.bool_], share: Array) -> Array | None:
+    """[K, 2] polygon around one crown, in pixels of its box with a margin taken off again."""
+    pad = 2
+    soft = np.pad(np.where(mine, np.maximum(share, 0.5), 0.0), pad).astype(np.float32)
+    soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), 0.8), np.float32)
+    size = (soft.shape[1] * _OUTLINE_SCALE, soft.shape[0] * _OUTLINE_SCALE)
+    fine = cv2.resize(soft, size, interpolation=cv2.INTER_CUBIC)
+    contours, _ = cv2.findContours(
+        (fine > 0.45).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    if not contours:
+        return None
+    contour = max(contours, key=cv2.contourArea)
+    contour = cv2.approxPolyDP(contour, _OUTLINE_TOLERANCE * _OUTLINE_SCALE, True)[:, 0]
+    if len(contour) < 3:
+        return None
+    # Contours run through the middles of the outermost pixels: half a pixel too far inside.
+    points = (contour + 0.5) / _OUTLINE_SCALE - pad
+    middle = points.mean(axis=0)
+    away = points - middle
+    length = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
+    return np.asarray(points + away / length * 0.5 / _OUTLINE_SCALE, np.float64)
+
+
+def _to_image(points: Array, answer_from_image: npt.NDArray[np.float64]) -> Array:
+    """[N, 2] points of the maps (pixel centres at .5) in pixels of the photograph."""
+    inverse = np.linalg.inv(answer_from_image[:, :2])
+    return np.asarray((points - answer_from_image[:, 2]) @ inverse.T)

@@ -1,0 +1,162 @@
+"""Read one photograph: two looks, crowns, jaws, order, numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.fdi import JAWS, Jaw, primary_of, teeth_of
+from pipeline.artifacts.teeth import Crown, Dentition
+from stages.geometry.crowns import Outline, centroid, dentition_of, row_roll
+from stages.geometry.tooth_rows import (
+    POSITIONS,
+    ChainOptions,
+    position_evidence,
+    row_probabilities,
+)
+from stages.teeth.instances import Found, find_crowns
+from stages.teeth.network import HEIGHT, KINDS, WIDTH, Answer, Transform, fitted, look
+from stages.teeth.numbers import looks
+
+Array32 = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+
+#: Free space around the teeth in the second look, as shares of their width.
+_MARGIN_X, _MARGIN_Y = 0.08, 0.10
+#: The first look must find so many crowns for a second one.
+_LEAST_CROWNS = 3
+#: Numbers less probable than this are not kept.
+_LEAST_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one photograph shows.
+
+    Attributes:
+        dentition: its crowns; kind "none" where no teeth were found.
+        kinds: kind of photograph -> probability.
+        apart: 0..1 probability, by the whole picture, that the jaws are apart.
+    """
+
+    dentition: Dentition
+    kinds: dict[str, float]
+    apart: float
+
+
+def read_photograph(
+    image: Array32, valid: Bool, name: str, options: ChainOptions | None = None
+) -> Reading:
+    """Find the crowns in one photograph.
+
+    Args:
+        image: [H, W, 3] float32 sRGB in 0..1.
+        valid: [H, W] bool: nothing is read outside.
+        name: of the view.
+        options: of the numbers.
+
+    Returns:
+        The reading, in pixels of the photograph.
+    """
+    height, width = image.shape[:2]
+    size = (width, height)
+    first = look(image, valid, fitted((height, width)), flip=False)
+    answer, crowns = first, find_crowns(first)
+    if len(crowns) >= _LEAST_CROWNS:
+        closer = look(image, valid, _closer(crowns), flip=True)
+        again = find_crowns(closer)
+        if sum(c.area for c in again) > 0.6 * sum(c.area for c in crowns):
+            answer, crowns = closer, again
+    kind = np.exp((first.kind + answer.kind) / 2)
+    kinds = {name: float(share) for name, share in zip(KINDS, kind / kind.sum(), strict=True)}
+    apart = 1 / (1 + math.exp(-float(np.clip((first.apart + answer.apart) / 2, -30, 30))))
+    if not crowns:
+        return Reading(Dentition(name, size, "none"), kinds, apart)
+    likely = max(kinds, key=lambda k: kinds[k])
+    outlines = _outlines(crowns, answer)
+    dentition = dentition_of(outlines, name, size, likely)
+    return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
+
+
+def _closer(crowns: list[Found]) -> Transform:
+    """The frame of the second look: upright, the teeth fill it."""
+    outlines = [Outline(crown.polygon, _jaw(crown.lower)) for crown in crowns]
+    roll = row_roll(outlines)
+    c, s = math.cos(-roll), math.sin(-roll)
+    turn = np.array([[c, -s], [s, c]])
+    points = np.concatenate([crown.polygon for crown in crowns]) @ turn.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, extent = (low + high) / 2, high - low
+    wanted = extent + 2 * extent[0] * np.array([_MARGIN_X, _MARGIN_Y])
+    scale = min(WIDTH / wanted[0], HEIGHT / wanted[1])
+    return np.column_stack([scale * turn, [WIDTH / 2, HEIGHT / 2] - scale * middle])
+
+
+def _jaw(lower: float) -> Jaw:
+    return "lower" if lower > 0 else "upper"
+
+
+def _outlines(crowns: list[Found], answer: Answer) -> list[Outline]:
+    """The crowns with their jaw and looks; a crown that is unsure goes with its neighbours."""
+    del answer
+    jaws = [_jaw(crown.lower) for crown in crowns]
+    return [
+        Outline(
+            polygon=crown.polygon,
+            jaw=jaw,
+            score=crown.score,
+            numbers={
+                tooth: share
+                for tooth, share in looks(crown.left, crown.primary, crown.position, jaw).items()
+                if share >= _LEAST_SHARE
+            },
+        )
+        for crown, jaw in zip(crowns, jaws, strict=True)
+    ]
+
+
+def numbered(dentition: Dentition, options: ChainOptions) -> Dentition:
+    """The dentition with each crown's most probable number and its doubt, by this photograph alone.
+
+    Numbers that a person has said (doubt 0) stay.
+    """
+    rows: dict[Jaw, tuple[Crown, ...]] = {}
+    for jaw in JAWS:
+        crowns = dentition.crowns(jaw)
+        evidence = np.array(
+            [position_evidence(crown.numbers, jaw, options) for crown in crowns]
+        ).reshape(-1, POSITIONS)
+        shares, _ = row_probabilities(evidence, options)
+        rows[jaw] = tuple(
+            crown if crown.doubt == 0 else _with_number(crown, jaw, share)
+            for crown, share in zip(crowns, shares, strict=True)
+        )
+    return replace(dentition, upper=rows["upper"], lower=rows["lower"])
+
+
+def _with_number(crown: Crown, jaw: Jaw, share: npt.NDArray[np.float64]) -> Crown:
+    best = int(np.argmax(share))
+    if best == POSITIONS:
+        return replace(crown, number=0, doubt=1.0)
+    tooth = teeth_of(jaw)[best]
+    if tooth % 10 <= 5:
+        milk = primary_of(tooth)
+        if crown.numbers.get(milk, 0.0) > crown.numbers.get(tooth, 0.0):
+            tooth = milk
+    return replace(crown, number=tooth, doubt=float(min(1.0, max(1e-4, 1 - share[best]))))
+
+
+def teeth_area(dentition: Dentition) -> float:
+    """Share of the photograph that is teeth."""
+    area = sum(abs(cv2.contourArea(c.outline.astype(np.float32))) for c in dentition.all_crowns)
+    return float(area / (dentition.size[0] * dentition.size[1]))
+
+
+def row_extent(dentition: Dentition) -> float:
+    """Width of the teeth over that of the photograph."""
+    centres = np.array([centroid(crown.outline) for crown in dentition.all_crowns])
+    return float(np.ptp(centres, axis=0).max() / max(dentition.size)) if len(centres) else 0.0

@@ -1,0 +1,318 @@
+"""`teeth.yaml`: what it may say, how it is found, and what it does to the teeth."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import toy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import pipeline
+from pipeline.artifacts.corrections import (
+    Corrections,
+    CrownCorrection,
+    PhotoCorrection,
+    corrections_file,
+    read_corrections,
+)
+from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.errors import ReconstructionError, RequestError
+from pipeline.store import Store
+from stages.geometry.corrections import LEFT_OUT, apply_corrections, area, split_polygon
+from tests import teeth_case as case
+
+GOOD = """
+photographs:
+  0_right.jpg:
+    use: true
+    kind: right
+    crowns:
+      - {at: [412, 300.5], tooth: 16}
+      - {at: [1, 2], remove: true}
+      - {at: [3, 4], split: [[1, 2], [3, 4.5]]}
+  "001": {use: false}
+  1.jpg:
+"""
+
+
+def test_what_the_page_writes_is_read(tmp_path: Path) -> None:
+    found = read_corrections(case.write(tmp_path / "teeth.yaml", GOOD))
+    crowns = (
+        CrownCorrection((412, 300.5), tooth=16),
+        CrownCorrection((1, 2), remove=True),
+        CrownCorrection((3, 4), split=((1, 2), (3, 4.5))),
+    )
+    assert found.photographs == {
+        "0_right.jpg": PhotoCorrection(True, "right", crowns),
+        "001": PhotoCorrection(use=False),
+        "1.jpg": PhotoCorrection(),
+    }
+    assert found
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "photographs:\n", "photographs: {a.jpg: {}}"])
+def test_an_empty_file_changes_nothing(tmp_path: Path, text: str) -> None:
+    found = read_corrections(case.write(tmp_path / "teeth.yaml", text))
+    assert not found
+    teeth = case.teeth()
+    assert apply_corrections(teeth, case.views(), found) is teeth
+
+
+def one(entry: str) -> str:
+    return "photographs: {a.jpg: {crowns: [" + entry + "]}}"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("photos: {}", r"'photos' is not known here.*Did you mean 'photographs'"),
+        ("[1, 2]", "must hold photographs"),
+        ("photographs: [a.jpg]", "must hold a photograph's name"),
+        ("photographs: {a.jpg: {used: true}}", r"photograph 'a.jpg': 'used' .*Did you mean 'use'"),
+        ("photographs: {a.jpg: {use: 1}}", "use must be true or false, not 1"),
+        ("photographs: {a.jpg: {use: yes}}", "use must be true or false, not 'yes'"),
+        ("photographs: {a.jpg: {kind: rigth}}", "kind must be.*Did you mean 'right'"),
+        ("photographs: {a.jpg: {crowns: {at: 1}}}", "crowns must be a list"),
+        (one("{tooth: 11}"), r"crowns\[0\] must say where the crown is"),
+        (one("{at: [1, 2]}"), "one of tooth, remove and split; it says at"),
+        (one("{at: [1, 2], tooth: 11, remove: true}"), "one of tooth, remove and split"),
+        (one("{at: [1, 2], tooth: 19}"), r"crowns\[0\].tooth: 19 is no tooth's number"),
+        (one("{at: [1, 2], tooth: true}"), "True is no tooth's number"),
+        (one("{at: [1, 2], tooth: 16.0}"), "16.0 is no tooth's number"),
+        (one("{at: [1, 2], tooth: 016}"), "'016' is no tooth's number"),
+        (one("{at: [1, 2], tooth: '16'}"), "'16' is no tooth's number"),
+        (one("{at: [1, 2], remove: false}"), "remove can only be true"),
+        (one("{at: [1, true], tooth: 11}"), r"crowns\[0\].at must be two numbers"),
+        (one("{at: [1, .nan], tooth: 11}"), "must be two numbers"),
+        (one("{at: [1, 1.0e99], tooth: 11}"), "must be two numbers"),
+        (one("{at: [1, 2, 3], tooth: 11}"), "must be two numbers"),
+        (one("{at: 5, tooth: 11}"), "must be two numbers"),
+        (one("{at: [1, 2], split: [[1, 2]]}"), "split must be two places"),
+        (one("{at: [1, 2], split: [[1, 2], [3]]}"), r"split\[1\] must be two numbers"),
+        (one("{at: [1, 2], split: [[1, 2], [1, 2]]}"), "the same place"),
+        ("photographs: {a: {use: true}, a: {use: false}}", "line 1: 'a' is said twice"),
+        ("photographs: {[1]: {}}", "a key must be a word"),
+        ("a: &x 1\nb: *x", "anchors and aliases"),
+        ("photographs: !!python/object:os.system {}", "tags"),
+        ("--- 1\n--- 2", "several documents"),
+        ("photographs: {", "is not YAML"),
+        ("a: \x00", "is not YAML"),
+        ("[" * 100_000, "nested deeper"),
+        ("- 1\n" * 100_000, "more entries"),
+        ("#" * 2**20 + "\n", "larger than 1 MB"),
+        ("a: " + "9" * 10_000, "'a' is not known"),
+    ],
+)  # fmt: skip
+def test_what_is_not_understood_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(RequestError, match=said) as caught:
+        read_corrections(case.write(tmp_path / "teeth.yaml", text))
+    assert str(tmp_path / "teeth.yaml") in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_a_bomb_of_aliases_does_not_go_off(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 30)]
+    with pytest.raises(RequestError, match="anchors and aliases"):
+        read_corrections(case.write(tmp_path / "teeth.yaml", "\n".join(lines)))
+
+
+def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "teeth.yaml"
+    path.write_bytes(random.Random(0).randbytes(5000))
+    with pytest.raises(RequestError, match="not text in UTF-8"):
+        read_corrections(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(RequestError, match="no such file"):
+        read_corrections(path)
+
+
+PIECES = [
+    "photographs", "a.jpg", ":", " ", "\n", "\n  ", "{", "}", "[", "]", ",", "at", "tooth", "16",
+    "- ", "use", "true", "&x", "*x", "!!", "---", "'", '"', "#", "~", "|", ">", "1e9",
+]  # fmt: skip
+
+
+@settings(deadline=None, max_examples=150, suppress_health_check=list(HealthCheck))
+@given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from(PIECES)).map("".join)))
+def test_any_text_is_read_or_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "teeth.yaml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    try:
+        assert isinstance(read_corrections(path), Corrections)
+    except RequestError as error:
+        assert str(path) in str(error)
+
+
+def test_where_the_file_is(tmp_path: Path) -> None:
+    request = {"images": [], "workspace": tmp_path}
+    assert corrections_file((), {}) is None
+    assert corrections_file((), request) is None
+    own = case.write(tmp_path / "teeth.yaml", "")
+    assert corrections_file((), request) == corrections_file(None, request) == own
+    other = case.write(tmp_path / "mine.yaml", "")
+    assert corrections_file(str(other), request) == other
+    with pytest.raises(RequestError, match=r"init.dental.labels: there is no file .*none.yaml"):
+        corrections_file(str(tmp_path / "none.yaml"), request)
+
+
+def applied(teeth: Teeth | None = None, **photographs: PhotoCorrection) -> tuple[Dentition, ...]:
+    named = {name.replace("_jpg", ".jpg").lstrip("v"): photo for name, photo in photographs.items()}
+    return apply_corrections(teeth or case.teeth(), case.views(), Corrections(named)).views
+
+
+def numbers(view: Dentition) -> list[int]:
+    return [crown.number for crown in view.all_crowns]
+
+
+def test_a_number_is_put_right_and_certain() -> None:
+    before = case.teeth().views
+    place = case.original(0, "upper")
+    photo = PhotoCorrection(crowns=(CrownCorrection(place, tooth=53),))
+    after = applied(v1_front=photo)  # a stem names the photograph too
+    assert after[0] is before[0] or numbers(after[0]) == numbers(before[0])
+    crown = after[1].upper[0]
+    assert (crown.number, crown.doubt) == (53, 0.0)
+    assert np.array_equal(crown.zenith, before[1].upper[0].zenith)
+    assert numbers(after[1])[1:] == numbers(before[1])[1:]
+
+
+def test_a_place_beside_a_crown_means_the_nearest() -> None:
+    x, y = case.original(0, "upper")
+    beside = CrownCorrection((x - case.SCALE * 0.9 * case.SIDE, y), tooth=14)
+    assert applied(v000=PhotoCorrection(crowns=(beside,)))[0].upper[0].number == 14
+    with pytest.raises(RequestError, match=r"'000', crowns\[0\]: there is no crown at 4"):
+        applied(v000=PhotoCorrection(crowns=(CrownCorrection((4, 4), tooth=14),)))
+
+
+def test_what_is_no_tooth_goes_and_landmarks_are_found_again() -> None:
+    before = case.teeth().views[0]
+    gone = CrownCorrection(case.original(1, "upper"), remove=True)
+    after = applied(v000=PhotoCorrection(crowns=(gone,)))[0]
+    assert numbers(after) == [13, 11, 21, 22, 23, *case.LOWER]
+    assert before.upper[0].papilla_right is not None
+    assert after.upper[0].papilla_right is None, "it has no neighbour any more"
+    everything = [CrownCorrection(case.original(k, jaw), remove=True)
+                  for jaw in ("upper", "lower") for k in range(6)]  # type: ignore[arg-type]  # fmt: skip
+    assert applied(v000=PhotoCorrection(crowns=tuple(everything)))[0].all_crowns == ()
+
+
+def test_a_crown_is_split_and_both_parts_numbered() -> None:
+    x, y = case.original(2, "upper")
+    top, end, side = y - 50, y + 60, case.SCALE * 7
+    after = applied(v000=PhotoCorrection(crowns=(
+        CrownCorrection((x, y), split=((x, top), (x + 1, end))),
+        CrownCorrection((x - side, y), tooth=12),
+        CrownCorrection((x + side, y), tooth=11),
+        CrownCorrection(case.original(1, "upper"), tooth=13),
+        CrownCorrection(case.original(0, "upper"), tooth=14),
+    )))[0]  # fmt: skip
+    assert numbers(after)[:7] == [14, 13, 12, 11, 21, 22, 23]
+    parts = after.upper[2:4]
+    assert [crown.doubt for crown in parts] == [0, 0]
+    whole = area(case.teeth().views[0].upper[2].outline)
+    assert sum(area(crown.outline) for crown in parts) == pytest.approx(whole)
+    assert parts[0].outline[:, 0].max() == pytest.approx(x / case.SCALE, abs=1)
+    unnumbered = CrownCorrection((x, y), split=((x, top), (x, end)))
+    halves = applied(v000=PhotoCorrection(crowns=(unnumbered,)))[0].upper[2:4]
+    assert [(crown.number, crown.doubt) for crown in halves] == [(0, 1.0), (0, 1.0)]
+    missed = CrownCorrection((x, y), split=((x + 400, top), (x + 400, end)))
+    with pytest.raises(RequestError, match="doesn't cross the crown"):
+        applied(v000=PhotoCorrection(crowns=(missed,)))
+
+
+def test_a_number_of_the_other_jaw_moves_the_crown() -> None:
+    change = CrownCorrection(case.original(5, "upper"), tooth=34)
+    after = applied(v000=PhotoCorrection(crowns=(change,)))[0]
+    assert 34 in [crown.number for crown in after.lower]
+    assert len(after.upper) == 5
+    assert after.lower[-1].tip[1] < after.lower[-1].zenith[1] or after.lower[-2].number == 34
+
+
+def test_photographs_are_left_out_used_and_called_otherwise() -> None:
+    teeth = case.teeth("it is blurred")
+    after = applied(
+        teeth, v000=PhotoCorrection(use=False), v001=PhotoCorrection(kind="left"),
+        v002=PhotoCorrection(use=True),
+    )  # fmt: skip
+    assert [view.set_aside for view in after] == [LEFT_OUT, "", ""]
+    assert [view.kind for view in after] == ["right", "left", "left"]
+    empty = Teeth((Dentition("000", (300, 200), "none"), *teeth.views[1:]))
+    with pytest.raises(RequestError, match="no tooth was found in this photograph"):
+        applied(empty, v000=PhotoCorrection(use=True))
+
+
+def test_unknown_and_doubled_photographs_are_refused() -> None:
+    with pytest.raises(RequestError, match=r"no photograph 'O_right.jpg'.*Did you mean '0_right"):
+        applied(O_right_jpg=PhotoCorrection(use=True))
+    with pytest.raises(RequestError, match=r"'000' and '0_right.jpg' are the same photograph"):
+        applied(v000=PhotoCorrection(use=True), v0_right_jpg=PhotoCorrection(use=False))
+
+
+@given(
+    st.floats(0, np.pi), st.floats(-0.5, 0.5),
+    st.lists(st.floats(0.3, 2.0), min_size=3, max_size=12),
+)  # fmt: skip
+def test_parts_of_a_polygon_make_the_whole(angle: float, off: float, radii: list[float]) -> None:
+    around = np.linspace(0, 2 * np.pi, len(radii), endpoint=False)
+    polygon = np.array(radii)[:, None] * np.stack([np.cos(around), np.sin(around)], 1)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    start = off * np.array([-along[1], along[0]])
+    parts = split_polygon(polygon, start, start + along)
+    assert sum(map(area, parts)) == pytest.approx(area(polygon))
+
+
+# -- the engine ------------------------------------------------------------------------------------
+
+
+def test_stages_know_the_workspace_but_their_keys_do_not(
+    toys: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sources(self: Any, config: Any, request: Any) -> dict[str, Path]:
+        path = corrections_file((), request)
+        return {"teeth.yaml": path} if path else {}
+
+    monkeypatch.setattr(toy.ScaleStage, "sources", sources)
+    run()
+    key = Store(toys / "w").current("scale").key  # type: ignore[union-attr]
+    pipeline.run(toys / "images", workspace=toys / "elsewhere", preset=toys / "toy.yaml")
+    assert Store(toys / "elsewhere").current("scale").key == key  # type: ignore[union-attr]
+    case.write(toys / "w" / "teeth.yaml", "photographs:\n")
+    assert pipeline.status(workspace=toys / "w")[1].reasons == ["input file added: teeth.yaml"]
+    assert run()["scale"] == "ran"
+    assert run()["scale"] == "cached"
+
+
+def test_what_a_failed_stage_made_is_kept_until_one_succeeds(
+    toys: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = {"teeth": case.teeth()}
+
+    def doubtful(self: Any, how: str) -> None:
+        if how:
+            picture = {"pair": np.zeros((4, 6, 3), np.uint8)}
+            raise ReconstructionError("Doubtful.", picture if how == "drawn" else {}, made)
+
+    monkeypatch.setattr(toy.CountStage, "_maybe_fail", doubtful)
+    monkeypatch.setattr("pipeline.report.check._views_of", lambda found: case.views())
+    with pytest.raises(ReconstructionError, match=r"Pictures .* To put it right, open .*check"):
+        run("count.fail=drawn")
+    folder = toys / "w" / "count" / "failure"
+    assert sorted(path.name for path in folder.iterdir()) == ["pair.png", "teeth"]
+    assert len(Store(toys / "w").evidence("count", "teeth").views) == 3
+    with pytest.raises(ReconstructionError, match=r"^Doubtful. To put it right, open"):
+        run("count.fail=plain")
+    assert [path.name for path in folder.iterdir()] == ["teeth"]
+    assert "check.html" not in (Store(toys / "w").failure("count") or {})["message"]
+    assert (toys / "w" / "check.html").is_file()
+    made.clear()
+    with pytest.raises(ReconstructionError, match=r"^Doubtful.$"):
+        run("count.fail=again")
+    assert not folder.exists() and not (toys / "w" / "check.html").exists()
+    run()

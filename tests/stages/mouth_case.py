@@ -1,0 +1,225 @@
+"""Photographs of generated mouths with exact outlines, numbers and cameras, as the reader would
+hand them over. The mouths come from `data_samples/mouths`, which knows nothing of the code under
+test: teeth of their own sizes, out of line, on arches of their own shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+
+from data_samples.mouths import Mouth, Photograph, photograph, random_mouth
+from data_samples.mouths.cameras import Camera, look
+from pipeline.artifacts.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
+from pipeline.artifacts.teeth import Dentition
+from pipeline.artifacts.views import View, Views
+from stages.geometry.crowns import Outline, dentition_of
+
+WIDTH, HEIGHT = 512, 384
+ROLES = ("right", "front", "left")
+#: A textbook mouth where nothing else is said: nobody's, but without the generator's rarities.
+CALM = {
+    "dentition": "permanent", "missing": (18, 28, 38, 48), "bite": "normal", "overbite": 2.2,
+    "overjet": 2.5, "cross": (0.0, 0.0), "crowding": 0.02, "twist": 5.0, "shift": 0.3,
+    "tilt": 2.0, "diastema": 0.0, "midline": 0.4, "recession": 0.0, "papilla": 1.0,
+    "braces_upper": False, "braces_lower": False, "conditions": (),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """Photographs of one mouth, in the order of the yaws asked for."""
+
+    photos: tuple[Photograph, ...]
+
+    @property
+    def views(self) -> Views:
+        return Views(
+            tuple(
+                View(
+                    f"{k:03d}",
+                    photo.image.astype(np.float32) / np.float32(255),
+                    source_name=f"photo{k}.jpg",
+                    source_size=(photo.image.shape[1], photo.image.shape[0]),
+                )
+                for k, photo in enumerate(self.photos)
+            )
+        )
+
+    def dentitions(self, **looks: Any) -> list[Dentition]:
+        """Exact outlines of every photograph, put in order as the reader's are."""
+        return [
+            dentition_of(
+                outlines_of(photo.labels, **looks),
+                f"{k:03d}",
+                (photo.image.shape[1], photo.image.shape[0]),
+                photo.view,
+            )
+            for k, photo in enumerate(self.photos)
+        ]
+
+    @property
+    def rotations(self) -> list[np.ndarray]:
+        return [photo.cam_from_world[:3, :3] for photo in self.photos]
+
+
+def mouth_case(
+    seed: int,
+    yaws: Sequence[float] = (-42.0, 3.0, 40.0),
+    rolls: Sequence[float] = (4.0, -2.0, -5.0),
+    distance: float = 125.0,
+    side: float = 1.9,
+    plain: bool = True,
+    calm: bool = True,
+    **options: Any,
+) -> Case:
+    """Photographs of a mouth at some yaws (degrees, from the patient's left positive).
+
+    Args:
+        side: focal length over the long side of the picture.
+        plain: without lips, hands, noise.
+        calm: without what is not asked for (`CALM`); else all at random.
+        options: of the mouth (`MouthOptions`).
+    """
+    rng = np.random.default_rng(seed)
+    mouth = random_mouth(rng, **({**CALM, **options} if calm else options))
+    centres = np.array(list(mouth.tooth_centres().values()))
+    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
+    photos = []
+    for yaw, roll in zip(yaws, rolls, strict=True):
+        role = ROLES[int(np.digitize(yaw, (-20, 20)))]
+        focal = side * WIDTH
+        view = look(yaw, 4.0, roll, distance, pivot)
+        camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, view)
+        photos.append(
+            photograph(
+                mouth, rng, role, width=WIDTH, height=HEIGHT, bite="closed", camera=camera,
+                plain=plain,
+            )
+        )  # fmt: skip
+    return Case(tuple(photos))
+
+
+def outlines_of(
+    labels: np.ndarray, least: float = 0.12, sure: float = 0.6, tell: bool = True
+) -> list[Outline]:
+    """The outlines of the crowns in a picture of FDI numbers, largest piece each.
+
+    Args:
+        labels: [H, W] FDI number of each pixel, 0: no tooth.
+        least: crowns of less than this share of the median area are left out, as slivers are.
+        sure: probability that looks give to the right place in the quadrant (see `looks_like`).
+        tell: with looks; else every number is as likely.
+    """
+    found: dict[int, np.ndarray] = {}
+    for number in (int(n) for n in np.unique(labels) if n):
+        if number % 10 == 8:
+            continue
+        contours, _ = cv2.findContours(
+            (labels == number).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        found[number] = max(contours, key=cv2.contourArea)[:, 0] + 0.5
+    areas = {number: cv2.contourArea(c.astype(np.float32)) for number, c in found.items()}
+    typical = float(np.median(list(areas.values())))
+    return [
+        Outline(
+            found[number].astype(np.float64),
+            "upper" if is_upper(number) else "lower",
+            0.9,
+            looks_like(number, sure) if tell else {},
+        )
+        for number in found
+        if areas[number] > max(least * typical, 12)
+    ]
+
+
+def looks_like(number: int, sure: float) -> dict[int, float]:
+    """What a fair reader says of a crown: the places beside the right one are likely too, the other
+    side of the mouth is not excluded, nor is the other set of teeth."""
+    place = permanent_of(number) % 10
+    beside = [p for p in (place - 1, place + 1) if 1 <= p <= 7]
+    shares = {place: sure} | {p: (1 - sure) / len(beside) for p in beside}
+    upper, left = is_upper(number), is_left(number)
+    result = {}
+    for p, share in shares.items():
+        for side, here in ((left, 0.85), (not left, 0.15)):
+            quadrant = (2 if side else 1) if upper else (3 if side else 4)
+            tooth = 10 * quadrant + p
+            milk = 0.8 if is_primary(number) else 0.2
+            if p <= 5:
+                result[primary_of(tooth)] = share * here * milk
+                result[tooth] = share * here * (1 - milk)
+            else:
+                result[tooth] = share * here
+    return result
+
+
+def true_numbers(photo: Photograph, dentition: Dentition) -> dict[str, tuple[int, ...]]:
+    """The numbers of the crowns of each row by the label map, 0 where a crown is none."""
+    rows = {}
+    for jaw in ("upper", "lower"):
+        numbers = []
+        for crown in dentition.crowns(jaw):  # type: ignore[arg-type]
+            mask = np.zeros(photo.labels.shape, np.uint8)
+            cv2.fillPoly(mask, [np.round(crown.outline - 0.5).astype(np.int32)], 1)
+            values, counts = np.unique(photo.labels[mask > 0], return_counts=True)
+            best = int(np.argmax(counts)) if len(counts) else 0
+            numbers.append(
+                int(values[best]) if len(counts) and counts[best] > 0.5 * mask.sum() else 0
+            )
+        rows[jaw] = tuple(numbers)
+    return rows
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two rotations."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1))))
+
+
+def relative_errors(found: Sequence[np.ndarray], true: Sequence[np.ndarray]) -> list[float]:
+    """Degrees between found and true relative rotations of all pairs."""
+    return [
+        angle_between(found[j] @ found[i].T, true[j] @ true[i].T)
+        for i in range(len(true))
+        for j in range(i + 1, len(true))
+    ]
+
+
+def arch_of(seed: int, **options: Any) -> dict[tuple[str, int], np.ndarray]:
+    """(kind, FDI number) -> [3] mm: the landmarks of a generated mouth, as `Landmark` has them.
+
+    A papilla or embrasure is named by the tooth nearer the patient's right.
+    """
+    rng = np.random.default_rng(seed)
+    return landmarks_of(random_mouth(rng, **{**CALM, **options}))
+
+
+def landmarks_of(mouth: Mouth) -> dict[tuple[str, int], np.ndarray]:
+    """The landmarks of a mouth by its crowns' own frames: x to the distal side, y from the tip."""
+    marks: dict[tuple[str, int], np.ndarray] = {}
+
+    def nearest(tooth: Any, x: float, y: float) -> np.ndarray:
+        outside = tooth.local[:, 2] >= np.median(tooth.local[:, 2])
+        off = np.hypot(tooth.local[:, 0] - x, tooth.local[:, 1] - y) + 100 * ~outside
+        return np.asarray(tooth.vertices[int(np.argmin(off))])
+
+    for row in mouth.rows:
+        for tooth in row.teeth:
+            height = tooth.plan.height
+            marks["zenith", tooth.plan.fdi] = nearest(tooth, 0.0, 0.92 * height)
+            marks["tip", tooth.plan.fdi] = nearest(tooth, 0.0, 0.0)
+        for right, left in pairwise(row.teeth):
+            for name, share in (("papilla", 0.62), ("embrasure", 0.12)):
+                sides = [
+                    nearest(
+                        tooth, tooth.side * toward * tooth.plan.width, share * tooth.plan.height
+                    )
+                    for tooth, toward in ((right, 0.5), (left, -0.5))
+                ]
+                marks[name, right.plan.fdi] = (sides[0] + sides[1]) / 2
+    return marks

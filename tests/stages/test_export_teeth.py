@@ -1,0 +1,220 @@
+"""`teeth.json`: numbers, doubts, outlines and places of teeth on a ball whose shape is known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from pipeline.artifacts.cameras import Cameras
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.views import View, Views
+from pipeline.stage import LocalContext
+from stages.export.scene import assemble
+from stages.export.stage import ExportConfig, ExportStage
+from stages.export.teeth import (
+    SeenCrown,
+    describe_teeth,
+    exported_outline,
+    joint_centre,
+    without_names,
+)
+from stages.geometry.known_cameras import KnownCamera, as_pinhole
+from tests.stages import export_scene as scene
+
+#: our world -> the input's millimetres
+SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])
+#: Where the middles of the crowns lie on the ball (unit vectors of the world, -z to the cameras).
+PLACES = {11: (0.1, -0.25, -1.0), 74: (-0.3, 0.3, -1.0)}
+CAP = 0.15  # angle from a crown's middle to its border
+QUIET = {"colmap": False, "mesh": False, "video": False, "viewer": False, "preview": False}
+
+
+def cap_outline(camera, direction, count=24):
+    """[K, 2] pixels of the border of a round crown on the ball."""
+    middle = np.array(direction) / np.linalg.norm(direction)
+    across = np.cross(middle, [0, 1.0, 0])
+    across /= np.linalg.norm(across)
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
+    ring = np.cos(angle) * across + np.sin(angle) * np.cross(middle, across)
+    return camera.project(np.cos(CAP) * middle + np.sin(CAP) * ring)[0]
+
+
+def crown_at(camera, number, doubt):
+    outline = cap_outline(camera, PLACES[number])
+    jaw = "upper" if number == 11 else "lower"
+    return Crown(
+        jaw=jaw, zenith=outline[0], tip=outline[12], papilla_left=None, papilla_right=None,
+        embrasure_left=None, embrasure_right=None, width=10.0, height=10.0, outline=outline,
+        number=number, doubt=doubt,
+    )  # fmt: skip
+
+
+def teeth_of_ball():
+    """Three placed photographs, one that could not be placed, and one that is set aside."""
+    doubts = ((0.02, 0.3), (0.1, 0.15), (0.4, 0.5))
+    size = (scene.WIDTH, scene.HEIGHT)
+    views = []
+    for camera, (upper, lower) in zip(scene.ball_cameras(), doubts, strict=True):
+        unsure = replace(crown_at(camera, 11, 1.0), number=0)
+        views.append(
+            Dentition(
+                camera.name, size, "front", (crown_at(camera, 11, upper), unsure),
+                (crown_at(camera, 74, lower),),
+            )
+        )  # fmt: skip
+    lost = replace(views[0], name="003")
+    same = "it shows the same as Smith John 7.jpg, which is clearer"
+    return Teeth((*views, lost, replace(views[0], name="004", set_aside=same)))
+
+
+def case():
+    found = scene.ball_case()
+    found["cameras"] = Cameras(found["cameras"].cameras, input_from_world=SIMILARITY, units="mm")
+    aside = View("004", found["views"].views[0].image, source_name="Smith_John_5.jpg")
+    found["views"] = Views((*found["views"].views, aside))
+    found["teeth"] = teeth_of_ball()
+    ball = found["gaussians"]  # so dense that its back does not shine through
+    opaque = np.full_like(ball.logit_opacities, 6.0)
+    found["gaussians"] = replace(ball, logit_opacities=opaque, log_scales=ball.log_scales + 0.2)
+    return found
+
+
+def export(folder: Path, inputs: dict) -> Path:
+    context = LocalContext(ExportConfig(**QUIET), folder, inputs, threads=1)
+    ExportStage().run(context)
+    return folder / "exports"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export(tmp_path_factory.mktemp("teeth"), case())
+
+
+@pytest.fixture(scope="module")
+def written(folder: Path) -> dict:
+    return json.loads((folder / "teeth.json").read_text())
+
+
+def test_each_tooth_once_with_its_numbers(written: dict) -> None:
+    first, second = written["teeth"]
+    assert (first["fdi"], first["universal"], first["dentition"], first["jaw"]) == (
+        11, "8", "permanent", "upper",
+    )  # fmt: skip
+    assert (second["fdi"], second["universal"], second["dentition"], second["jaw"]) == (
+        74, "L", "primary", "lower",
+    )  # fmt: skip
+    assert (first["doubt"], second["doubt"]) == (0.02, 0.15), "the least of the photographs"
+    assert [seen["doubt"] for seen in first["seen_in"]] == [0.02, 0.1, 0.4]
+
+
+def test_centres_are_where_the_crowns_are(written: dict) -> None:
+    assert written["units"] == "mm" and written["frame"] == "input"
+    for tooth in written["teeth"]:
+        direction = np.array(PLACES[tooth["fdi"]])
+        truth = SIMILARITY[:3, :3] @ (direction / np.linalg.norm(direction)) + SIMILARITY[:3, 3]
+        # the ball has a radius of 20 mm, the crowns are 6 mm wide
+        np.testing.assert_allclose(tooth["centre"], truth, atol=0.5)
+        assert 0 < tooth["spread"] < 2
+
+
+def test_outlines_are_pixels_of_the_images(written: dict) -> None:
+    for camera, seen in zip(scene.ball_cameras(), written["teeth"][0]["seen_in"], strict=True):
+        assert seen["photograph"] == camera.name
+        np.testing.assert_allclose(seen["outline"], cap_outline(camera, PLACES[11]), atol=0.006)
+
+
+def test_photographs_say_why_they_are_not_used(written: dict, folder: Path) -> None:
+    said = {photo["name"]: photo["set_aside"] for photo in written["photographs"]}
+    assert said == {
+        "000": "", "001": "", "002": "", "003": "it could not be placed",
+        "004": "it shows the same as another photograph, which is clearer",
+    }  # fmt: skip
+    assert [photo["used"] for photo in written["photographs"]] == [True] * 3 + [False] * 2
+    assert written["photographs"][0]["unnumbered_crowns"] == 1
+    for path in folder.iterdir():
+        assert b"Smith" not in path.read_bytes()
+
+
+def test_it_is_described(folder: Path) -> None:
+    description = json.loads((folder / "scene.json").read_text())
+    assert "teeth.json" in description["files"]
+    assert description["counts"]["teeth"] == 2
+    assert "teeth.json has 2 teeth" in (folder / "README.txt").read_text()
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path, folder: Path) -> None:
+    again = export(tmp_path, case())
+    assert (again / "teeth.json").read_bytes() == (folder / "teeth.json").read_bytes()
+
+
+def test_without_teeth_there_is_no_file(tmp_path: Path) -> None:
+    inputs = case()
+    names = [view.name for view in inputs["views"].views]
+    inputs["teeth"] = Teeth(tuple(Dentition(n, (scene.WIDTH, scene.HEIGHT), "none") for n in names))
+    out = export(tmp_path, inputs)
+    assert not (out / "teeth.json").exists()
+    assert "teeth.json" not in (out / "README.txt").read_text()
+
+
+def test_a_crown_without_depth_has_no_place() -> None:
+    inputs = case()
+    first = inputs["teeth"].views[0]
+    corner = np.array([[2.0, 2], [9, 2], [9, 9], [2, 9]])  # beside the ball
+    beside = replace(first.upper[0], outline=corner)
+    made = assemble(
+        inputs["views"], Cameras(inputs["cameras"].cameras[:1]), inputs["gaussians"], None,
+        np.eye(4), 1, lambda *_: None,
+    )  # fmt: skip
+    alone = Teeth((replace(first, upper=(beside,), lower=()),))
+    found = describe_teeth(alone, inputs["views"], made.cameras, made.seen, "world", "arbitrary")
+    assert found["teeth"][0]["centre"] is None and found["teeth"][0]["spread"] is None
+    assert len(found["teeth"][0]["seen_in"]) == 1
+
+
+def test_centres_count_by_the_pixels_that_show_the_crown() -> None:
+    def seen(x, pixels):
+        centre = None if x is None else np.array([x, 0.0, 0])
+        return SeenCrown("000", 11, 0.1, np.zeros((3, 2)), centre, pixels)
+
+    centre, spread = joint_centre([seen(0.0, 300), seen(4.0, 100), seen(None, 2)])
+    np.testing.assert_allclose(centre, [1, 0, 0])
+    assert spread == pytest.approx(3)
+    assert joint_centre([seen(None, 0)]) == (None, None)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
+    width, height = (90, 120) if turned else (120, 90)
+    v, u = np.mgrid[:height, :width] + 0.5
+    image = np.stack([u / 128, v / 128, 0 * u], -1).astype(np.float32)
+    transform = np.array([[0, -1.0, 90], [1, 0, 0], [0, 0, 1]]) if turned else np.eye(3)
+    view = View("000", image, working_from_source=transform, source_size=(120, 90))
+    lens = pycolmap.Camera(
+        model="OPENCV", width=240, height=180, params=[210, 205, 122, 88, -0.2, 0.05, 1e-3, 2e-3]
+    )
+    straight, _ = as_pinhole(view, KnownCamera("000", lens, np.eye(4)))
+    outline = np.array([[20.0, 25], [70, 22], [75, 70], [15, 60]])
+    moved = exported_outline(outline, (width, height), straight)
+    assert np.abs(moved - outline).max() > 1
+    index = (moved - 0.5).astype(np.float32)
+    shown = cv2.remap(straight.image, index[None, :, 0], index[None, :, 1], cv2.INTER_LINEAR)
+    # the undistorted image has 8 bits: its coordinates are rounded to half pixels
+    np.testing.assert_allclose(shown[0, :, :2] * 128, outline, atol=0.27)
+
+
+def test_outlines_follow_an_image_of_another_size() -> None:
+    view = View("000", np.zeros((60, 80, 3), np.float32))
+    moved = exported_outline(np.array([[40.0, 30]]), (160, 120), view)
+    np.testing.assert_allclose(moved, [[20, 15]])
+
+
+def test_reasons_name_no_file() -> None:
+    views = {"002": View("002", np.zeros((2, 2, 3), np.float32), source_name="A Smith.jpg")}
+    reason = "it shows the same as A Smith.jpg, which is clearer"
+    assert without_names(reason, views) == "it shows the same as 002, which is clearer"
+    assert "Smith" not in without_names(reason, {})
+    assert without_names("the jaws are apart in it", views) == "the jaws are apart in it"

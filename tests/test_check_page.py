@@ -1,0 +1,232 @@
+"""The page to put the teeth right: when it is written, what it says, how a browser takes it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.corrections import read_corrections
+from pipeline.artifacts.teeth import Teeth
+from pipeline.report import run_report
+from pipeline.store import Store
+from stages.geometry.corrections import apply_corrections
+from tests import teeth_case as case
+from tests.browser import browse, console, needs_chromium
+from tests.report_case import write_result
+from tests.report_page import assert_alone, text_of
+
+
+def doubtful_case(folder: Path, teeth: Teeth | None = None, failure: str = "Doubtful.") -> Path:
+    """A workspace in which init found teeth, but no safe result."""
+    folder.mkdir()
+    request = {"images": ["/photos"], "preset": None, "overrides": ["fit.iterations=20"],
+               "stages": ["views", "init"], "from": None}  # fmt: skip
+    (folder / "request.json").write_text(json.dumps(request))
+    write_result(folder, "views", [case.views()])
+    store = Store(folder)
+    store.keep_evidence("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
+    store.record_failure("init", "key", failure)
+    return folder
+
+
+def data_of(page: str) -> dict[str, object]:
+    found = re.search(r'id="data">(.*?)</script>', page, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+def test_a_doubtful_case_gets_the_page_and_the_report_leads_to_it(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "Anna", failure="Two <i>numberings</i> are as good.")
+    report = run_report(workspace).read_text()
+    assert 'href="check.html"' in report
+    assert "Put the teeth right" in text_of(report)
+    assert "it is <b>blurred</b>" in html.unescape(report)
+    page = (workspace / "check.html").read_text()
+    assert_alone(page)
+    assert "Two &lt;i&gt;numberings&lt;/i&gt; are as good." in page
+    assert "<left>" not in page
+    photographs = data_of(page)["photographs"]
+    assert [photo["name"] for photo in photographs] == list(case.NAMES)
+    assert photographs[0]["scale"] == [case.SCALE, case.SCALE]
+    assert photographs[2]["aside"] == "it is <b>blurred</b>"
+    first = photographs[0]["crowns"][0]
+    assert first["number"] == 13 and first["jaw"] == "upper"
+    assert first["offered"] == [[13, 0.7], [53, 0.2]]
+    run_report(workspace)
+    assert (workspace / "check.html").read_text() == page, "the same case gives the same page"
+
+
+def test_numbered_teeth_of_a_run_that_succeeded_can_be_checked_too(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    store = Store(workspace)
+    picture = np.full((20, 30, 3), 90, np.uint8)
+    numbered = replace(case.teeth("it is blurred"), pictures={"000": picture})
+    write_result(workspace, "init", [numbered])
+    assert store.failure("init") is None
+    report = run_report(workspace).read_text()
+    assert (workspace / "check.html").is_file()
+    assert "Check the teeth" in report
+    assert "right, 12 of 12 teeth numbered" in text_of(report)
+    assert "takes no part: it is blurred" in text_of(report)
+
+
+def test_without_numbers_there_is_no_page_and_an_old_one_goes(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    run_report(workspace)
+    assert (workspace / "check.html").is_file()
+    bare = Teeth(tuple(case.dentition(f"{k:03d}", "front", [0] * 6, [0] * 6) for k in range(3)))
+    write_result(workspace, "init", [bare])
+    report = run_report(workspace).read_text()
+    assert not (workspace / "check.html").exists()
+    assert "check.html" not in report
+
+
+@pytest.mark.parametrize("text", ["photographs: [", "photographs: {x: {used: 1}}"])
+def test_a_wrong_file_is_said_on_the_page(tmp_path: Path, text: str) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    case.write(workspace / "teeth.yaml", text)
+    run_report(workspace)
+    page = (workspace / "check.html").read_text()
+    assert "Saving here writes it anew." in text_of(page)
+    assert "could not be drawn" not in (workspace / "report.html").read_text()
+
+
+PROBE = """<script>
+(async () => {
+  const result = {};
+  const wait = (ms = 50) => new Promise((done) => setTimeout(done, ms));
+  const all = (query, inside = document) => [...inside.querySelectorAll(query)];
+  const card = (k) => all("article")[k];
+  const chip = (k, text) => all(".chip", card(k)).find((entry) => entry.textContent === text);
+  const deed = (text) => all("#panel button").find((entry) => entry.textContent.startsWith(text));
+  const press = (key, more = {}) => document.activeElement.dispatchEvent(
+    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...more }));
+  const row = (k) => all(".chip", card(k)).map((entry) => entry.textContent);
+  const notes = (k) => card(k).querySelector(".notes").textContent;
+  result.cards = all("article").length;
+  result.left = all("#aside figure").map((entry) => entry.textContent);
+  result.rest = document.getElementById("panel").textContent;
+
+  all(".crown polygon", card(0))[0].dispatchEvent(new MouseEvent("click", { bubbles: true }));
+  result.chosen = document.activeElement.textContent;
+  result.says = document.querySelector("#panel .now div").textContent;
+  press("1"); press("2");
+  result.twice = notes(0);
+  press("z", { ctrlKey: true });
+  result.undone = row(0)[0];
+  press("1"); press("9");
+  result.refused = document.getElementById("said").textContent;
+  press("5"); press("3");
+  press("ArrowRight"); press("ArrowDown"); press("ArrowRight");
+  result.walked = document.activeElement.textContent;
+  press("Delete");
+  result.afterRemoval = row(0);
+
+  chip(1, "21").click();
+  deed("Split").click();
+  const svg = card(1).querySelector("svg");
+  const box = svg.querySelector(".chosen polygon").getBoundingClientRect();
+  svg.setPointerCapture = () => {};
+  const drag = (type, y) => svg.dispatchEvent(new PointerEvent(type, { bubbles: true,
+    cancelable: true, pointerId: 3, clientX: box.x + box.width / 2, clientY: y }));
+  drag("pointerdown", box.y - 5); drag("pointermove", box.y + 9); drag("pointerup", box.bottom + 5);
+  svg.dispatchEvent(new MouseEvent("click", { bubbles: true }));
+  result.split = row(1);
+  press("2"); press("1");
+  deed("Number the row").click();
+  result.renumbered = row(1);
+  chip(1, "42").click();
+  press("s"); press("ArrowRight"); press("Enter");
+  result.splitByKeys = row(1).slice(7);
+  press("z", { ctrlKey: true });
+  card(1).querySelector("select").value = "left";
+  card(1).querySelector("select").dispatchEvent(new Event("change"));
+  all("#aside button")[0].click();
+  all(".head button", card(2)).find((entry) => /All numbers/.test(entry.textContent)).click();
+  result.cards += all("article").length;
+
+  window.showSaveFilePicker = undefined;
+  window.Blob = class { constructor(parts) { result.yaml = parts.join(""); } };
+  URL.createObjectURL = () => "blob:x";
+  HTMLAnchorElement.prototype.click = function () { result.download = this.download; };
+  document.getElementById("save").click();
+  await wait();
+  result.next = document.getElementById("next").textContent;
+  result.overflow = document.documentElement.scrollWidth - innerWidth;
+  result.requests = performance.getEntriesByType("resource").map((entry) => entry.name)
+    .filter((name) => !name.startsWith("data:"));
+  const text = document.createElement("pre");
+  text.id = "result";
+  text.textContent = JSON.stringify(result);
+  document.body.append(text);
+})();
+</script></body>"""
+
+
+READ = """<script>
+const text = document.createElement("pre");
+text.id = "result";
+text.textContent = check.yaml();
+document.body.append(text);
+</script></body>"""
+
+
+@needs_chromium
+def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "a case")
+    (tmp_path / "browser").mkdir()
+    run_report(workspace)
+    page = workspace / "check.html"
+    page.write_text(page.read_text().replace("</body>", PROBE))
+    dom, log = browse(page, tmp_path / "browser", (1300, 900), "--dump-dom")
+    assert console(log) == []
+    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
+    assert found
+    result = json.loads(html.unescape(found[1]))
+    assert result["cards"] == 2 + 3
+    assert result["left"] == ["2_<left>.jpgit is <b>blurred</b>Use it"]
+    assert "Nothing looks wrong" in result["rest"]
+    assert result["chosen"] == "13"
+    assert "upper right canine" in result["says"]
+    assert "12 stands twice" in result["twice"]
+    assert result["undone"] == "13"
+    assert "19 is no FDI number" in result["refused"]
+    assert result["walked"] == "41"
+    assert " ".join(result["afterRemoval"]) == "53 12 11 21 22 23 43 42 31 32 33"
+    assert result["split"][:7] == ["13", "12", "11", "?", "?", "22", "23"]
+    assert result["renumbered"][:7] == ["13", "12", "11", "21", "22", "23", "24"]
+    assert result["splitByKeys"] == ["43", "?", "?", "41", "31", "32", "33"]
+    assert result["overflow"] == 0 and result["requests"] == []
+    assert result["download"] == "teeth.yaml"
+    assert f"folder, beside this page: {workspace}." in result["next"]
+    assert (
+        f"pipeline run -w '{workspace}' --stages views,init --set fit.iterations=20"
+        in result["next"]
+    )
+
+    corrections = read_corrections(case.write(workspace / "teeth.yaml", result["yaml"]))
+    after = apply_corrections(case.teeth("x"), case.views(), corrections).views
+    rows = [[crown.number for crown in view.all_crowns] for view in after]
+    assert rows[0] == [53, 12, 11, 21, 22, 23, 43, 42, 31, 32, 33]
+    assert rows[1] == [13, 12, 11, 21, 22, 23, 24, *case.LOWER]
+    assert rows[2] == [*case.UPPER, *case.LOWER]
+    assert after[1].kind == "left" and after[2].set_aside == ""
+    assert {crown.doubt for crown in after[2].all_crowns} == {0.0}
+
+    # A second look: what was put right before stays in the file that the page writes.
+    store = Store(workspace)
+    store.keep_evidence("init", {}, {"teeth": Teeth(after)})
+    run_report(workspace)
+    again = data_of((workspace / "check.html").read_text())["photographs"]
+    assert [len(photo["earlier"]["crowns"]) for photo in again] == [2, 8, 12]
+    assert again[2]["earlier"]["use"] is True
+    page.write_text(page.read_text().replace("</body>", READ))
+    dom, _ = browse(page, tmp_path / "browser", (1300, 900), "--dump-dom")
+    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
+    assert found and html.unescape(found[1]) == result["yaml"]

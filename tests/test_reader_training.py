@@ -1,0 +1,119 @@
+"""The training script's parts: labels that follow the picture, and weights that mean the same."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+TOOLS = Path(__file__).parents[1] / "tools" / "reader"
+sys.path.insert(0, str(TOOLS))
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from augment import example, frame  # noqa: E402
+from export import to_onnx  # noqa: E402
+from network import CHANNELS, HEIGHT, VIEWS, WIDTH, Reader  # noqa: E402
+from samples import MIRRORED, UNNUMBERED, Sample, distance_inside  # noqa: E402
+from train import collate, losses  # noqa: E402
+
+
+def sample(numbered: bool = True) -> Sample:
+    """Four crowns as rectangles: 11, 21 above 41, 31; each in a grey of its own."""
+    teeth = np.zeros((120, 160), np.uint8)
+    image = np.full((120, 160, 3), 120, np.uint8)
+    for tooth, x, y in ((11, 40, 20), (21, 80, 20), (41, 45, 62), (31, 80, 62)):
+        teeth[y : y + 40, x : x + 35] = tooth
+        image[y : y + 40, x : x + 35] = 150 + tooth
+    numbers = teeth if numbered else np.where(teeth > 0, UNNUMBERED, 0).astype(np.uint8)
+    return Sample("made", image, teeth, numbers, distance_inside(teeth), 0, 0)
+
+
+def test_mirrored_numbers_are_their_own_inverse() -> None:
+    assert (MIRRORED[MIRRORED] == np.arange(256)).all()
+    assert MIRRORED[11] == 21 and MIRRORED[48] == 38 and MIRRORED[55] == 65 and MIRRORED[71] == 81
+    assert MIRRORED[0] == 0 and MIRRORED[UNNUMBERED] == UNNUMBERED
+
+
+def test_distance_is_largest_amid_each_crown() -> None:
+    inside = sample().inside
+    assert inside[40, 57] == 255 and inside[21, 41] < 60 and inside[5, 5] == 0
+
+
+def test_first_look_fits_the_picture() -> None:
+    found = example(sample(), None)
+    assert found.image.shape == (3, HEIGHT, WIDTH) and found.tooth.shape == (
+        HEIGHT // 2,
+        WIDTH // 2,
+    )
+    assert set(np.unique(found.number)) == {0, 11, 21, 31, 41}
+    corner = frame((120, 160)) @ [40, 20, 1] / 2
+    column, row = (
+        np.argwhere((found.number == 11).any(axis=0))[0, 0],
+        np.argwhere((found.number == 11).any(axis=1))[0, 0],
+    )
+    assert abs(column - corner[0]) <= 1 and abs(row - corner[1]) <= 1
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_numbers_follow_every_change(seed: int) -> None:
+    """Where the patient's left is stays right of its right unless the picture is unnumbered."""
+    found = example(sample(), np.random.default_rng(seed))
+    if UNNUMBERED in found.number:
+        return
+    places = {tooth: np.argwhere(found.number == tooth) for tooth in (11, 21)}
+    if min(len(p) for p in places.values()) > 20:
+        # The greys tell which crown was which before it was mirrored.
+        assert places[11][:, 1].mean() < places[21][:, 1].mean()
+    assert ((found.tooth > 0.9) <= (found.number > 0)).mean() > 0.99
+    assert found.border.max() == 1 or len(np.unique(found.number)) < 3
+
+
+def test_unknown_numbers_teach_nothing_of_numbers() -> None:
+    torch.manual_seed(0)
+    net = Reader()
+    known, unknown = (collate([example(sample(n), None)]) for n in (True, False))
+    answer, kind = net.eval()(known["image"])
+    parts = [losses(answer, kind, batch) for batch in (known, unknown)]
+    assert parts[0]["jaw"] > 0 and parts[1]["jaw"] == 0 and parts[1]["position"] == 0
+    assert torch.isclose(parts[0]["tooth"], parts[1]["tooth"])
+
+
+def test_a_few_steps_learn_something() -> None:
+    torch.manual_seed(0)
+    net = Reader((8, 8, 16, 16, 16))
+    batch = collate([example(sample(), None), example(sample(), np.random.default_rng(1))])
+    optimiser = torch.optim.AdamW(net.parameters(), 3e-3)
+    totals = []
+    for _ in range(6):
+        total = sum(losses(*net(batch["image"]), batch).values())
+        optimiser.zero_grad()
+        total.backward()
+        optimiser.step()
+        totals.append(float(total))
+    assert totals[-1] < 0.9 * totals[0]
+
+
+def test_opencv_runs_what_torch_learned(tmp_path: Path) -> None:
+    """Normalisation folded in and weights in half precision change the answer by little."""
+    torch.manual_seed(0)
+    net = Reader((8, 16, 16, 16, 32))
+    picture = torch.randn(1, 3, HEIGHT, WIDTH)
+    for _ in range(3):
+        net.train()(picture)  # means and variances that are not 0 and 1
+    path = tmp_path / "reader.onnx"
+    path.write_bytes(to_onnx(net.eval()).SerializeToString())
+    with torch.no_grad():
+        answer, kind = net(picture)
+    shipped = cv2.dnn.readNetFromONNX(str(path))
+    shipped.setInput(picture.numpy())
+    maps, views = shipped.forward(["answer", "kind"])
+    assert maps.shape == (1, CHANNELS, HEIGHT // 2, WIDTH // 2) and views.shape == (
+        1,
+        len(VIEWS) + 1,
+    )
+    assert np.abs(maps - answer.numpy()).max() < 0.02 * np.abs(answer.numpy()).max()
+    assert np.abs(views - kind.numpy()).max() < 0.02 * max(1, np.abs(kind.numpy()).max())
