@@ -1,7 +1,7 @@
 """Real mouths: which cases become a scene, with which numbers, and what must not pass.
 
     python benchmarks/triads.py --data DIR [--out DIR] [--only CASE,...] [--mixes N] [--series]
-                                [--leave-one-out] [--threads 2] [--set FIELD=VALUE ...]
+                                [--leave-one-out] [--threads 2] [--jobs 1] [--set FIELD=VALUE ...]
 
 DIR holds `triads/` (three photographs and `truth.json` per patient) and `series/` (everything that
 a clinic took). Each case goes through the stages views, teeth and init as on the command line
@@ -21,8 +21,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -40,36 +47,30 @@ from triads_scores import (
     score_item,
 )
 
+Line = Callable[[Row], str]
 #: Characters of a reason that a line of the table shows.
 SHOWN = 110
+#: Items after which the figures are written, in case that a long run is ended.
+KEPT_EVERY = 12
 #: Wrong numbers that it lists.
 LISTED = 5
 
 
-class Sheets:
-    """Rows of the contact sheets, collected as items are run."""
-
-    def __init__(self) -> None:
-        self.rows: dict[str, list[Picture]] = {"cases": [], "turned": [], "series": [], "mixes": []}
-
-    def add(self, row: Row, outcome: Outcome) -> None:
-        """Show every case and series, and of the mixes those that were accepted."""
-        state = "accepted" if row["accepted"] else "refused"
-        state += "" if row["right"] else ", would be wrong"
-        text = f"{row['name']}: {state}  {row['why_not']}"[:190].encode("ascii", "replace").decode()
-        name = {CASE: "cases", SERIES: "series"}.get(row["sort"], "mixes")
-        if name == "mixes" and not row["accepted"]:
-            return
-        overlay = overlay_row(outcome, row["sort"])
-        if overlay is not None:
-            self.rows[name].append(captioned(overlay, text))
-        if row["accepted"] and "turned" in outcome.pictures and name != "mixes":
-            self.rows["turned"].append(captioned(outcome.pictures["turned"], text))
-
-    def write(self, folder: Path) -> None:
-        """All sheets as PNG."""
-        for name, rows in self.rows.items():
-            write_sheets(folder, name, rows)
+def sheet_rows(row: Row, outcome: Outcome) -> dict[str, Picture]:
+    """Name of a contact sheet -> what it shows of an item: of mixes those that were accepted."""
+    state = "accepted" if row["accepted"] else "refused"
+    state += "" if row["right"] else ", would be wrong"
+    text = f"{row['name']}: {state}  {row['why_not']}"[:190].encode("ascii", "replace").decode()
+    name = {CASE: "cases", SERIES: "series"}.get(row["sort"], "mixes")
+    if name == "mixes" and not row["accepted"]:
+        return {}
+    rows: dict[str, Picture] = {}
+    overlay = overlay_row(outcome, row["sort"])
+    if overlay is not None:
+        rows[name] = captioned(overlay, text)
+    if row["accepted"] and "turned" in outcome.pictures and name != "mixes":
+        rows["turned"] = captioned(outcome.pictures["turned"], text)
+    return rows
 
 
 def case_line(row: Row) -> str:
@@ -86,7 +87,7 @@ def case_line(row: Row) -> str:
         row["name"],
         "yes" if row["accepted"] else "no",
         f"{whole['found']}/{whole['points']} ({whole['in_one_crown']})",
-        f"{whole['right']}",
+        f"{whole['right']} ({whole['right_place']})",
         f"{partial['right']}/{partial['points']}",
         wrong or "-",
         "-" if row["confidence"] is None else f"{row['confidence']:.3g}",
@@ -98,9 +99,10 @@ def case_line(row: Row) -> str:
 
 
 CASE_HEAD = (
-    "| case | scene | found (in one crown) | right | partial, right | wrong numbers | confidence "
-    "| epipolar, px (of band) | s: views / teeth / init | why not |\n" + "|---" * 10 + "|"
-)
+    "| case | scene | found (in one crown) | right (place) | partial, right | wrong numbers "
+    "| confidence | epipolar, px (of band) | s: views / teeth / init | why not |\n"
+    + "|---" * 10 + "|"
+)  # fmt: skip
 
 
 def series_line(row: Row) -> str:
@@ -133,6 +135,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         "right_numbers_refused": sum(row["right"] for row in cases if not row["accepted"]),
         "points_found_in_all": _share(cases, "found"),
         "points_right_in_all": _share(cases, "right"),
+        "points_in_right_place_in_all": _share(cases, "right_place"),
         "points_in_one_crown_in_all": _share(cases, "in_one_crown"),
         "points_in_accepted": points,
         "points_right_in_accepted": _share(passed, "right"),
@@ -187,18 +190,67 @@ def decided_shares(rows: Sequence[Row]) -> tuple[float, float]:
     return sum(good) / max(len(good), 1), sum(wrong) / max(len(wrong), 1)
 
 
+@dataclass
+class Results:
+    """What was found so far: figures, and rows of the contact sheets by their names."""
+
+    rows: list[Row]
+    sheets: dict[str, list[Picture]]
+
+    def add(
+        self, items: Iterable[tuple[Row, dict[str, Picture]]], line: Line, folder: Path
+    ) -> None:
+        """Take in items as they are done, with a line each (none where it is empty)."""
+        for number, (row, pictures) in enumerate(items, start=1):
+            self.rows.append(row)
+            if number % KEPT_EVERY == 0:
+                self.write_figures(folder)
+            for name, picture in pictures.items():
+                self.sheets.setdefault(name, []).append(picture)
+            if text := line(row):
+                print(text, flush=True)
+
+        self.write_figures(folder)
+        for name, sheet in self.sheets.items():
+            write_sheets(folder, name, sheet)
+
+    def write_figures(self, folder: Path) -> None:
+        """`triads.json` and the curve."""
+        found = thresholds(self.rows)
+        content = {"totals": totals(self.rows), "thresholds": found, "items": self.rows}
+        (folder / "triads.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
+        threshold = found["lowest_that_accepts_no_wrong"]
+        draw_curve(folder / "curve.png", found["curve"], decided_shares(self.rows), threshold)
+
+
+def run_item(runner: Runner, item: Item) -> tuple[Row, dict[str, Picture]]:
+    """Figures and pictures of one item."""
+    outcome = runner.run(item)
+    row = score_item(item, outcome)
+    return row, sheet_rows(row, outcome)
+
+
 def run_items(
-    runner: Runner, items: Sequence[Item], rows: list[Row], sheets: Sheets, line: Any
-) -> None:
-    """Run items, print a line each, and add their figures and pictures."""
-    for item in items:
-        outcome = runner.run(item)
-        row = score_item(item, outcome)
-        rows.append(row)
-        sheets.add(row, outcome)
-        text = line(row)
-        if text:
-            print(text, flush=True)
+    runner: Runner, items: Sequence[Item], jobs: int
+) -> Iterator[tuple[Row, dict[str, Picture]]]:
+    """Run items in their order, in as many processes as `jobs`."""
+    if jobs == 1:
+        yield from map(partial(run_item, runner), items)
+        return
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(jobs, spawn, _end_with_parent, (os.getpid(),)) as pool:
+        yield from pool.map(partial(run_item, runner), items)
+
+
+def _end_with_parent(parent: int) -> None:
+    """Let no process of the pool outlive a benchmark that was killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(2)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def mix_line(row: Row) -> str:
@@ -210,16 +262,6 @@ def mix_line(row: Row) -> str:
     if row["sort"] == SWAPPED and not row["accepted"]:
         return f"- refused: {row['name']}: {' '.join(row['doubts'])[:SHOWN]}"
     return ""
-
-
-def write(folder: Path, rows: Sequence[Row], sheets: Sheets) -> None:
-    """`triads.json`, the curve and the sheets."""
-    found = thresholds(rows)
-    content = {"totals": totals(rows), "thresholds": found, "items": list(rows)}
-    (folder / "triads.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
-    threshold = found["lowest_that_accepts_no_wrong"]
-    draw_curve(folder / "curve.png", found["curve"], decided_shares(rows), threshold)
-    sheets.write(folder)
 
 
 def settings_of(texts: Sequence[str]) -> dict[str, Any]:
@@ -244,6 +286,7 @@ def main() -> None:
     parser.add_argument("--series", action="store_true", help="whole folders too")
     parser.add_argument("--leave-one-out", action="store_true", help="print it for the thresholds")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=1, help="processes that run mixes")
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="of init")
     options = parser.parse_args()
     if options.data is None:
@@ -261,24 +304,20 @@ def run(options: argparse.Namespace, folder: Path) -> None:
     cases = [case for case in every if not only or case.name in only]
     series = read_series(options.data, cases)
     runner = Runner(folder / "readings", options.threads, settings_of(options.set))
-    rows: list[Row] = []
-    sheets = Sheets()
+    results = Results([], {})
+    rows = results.rows
     print(CASE_HEAD)
-    run_items(runner, cases, rows, sheets, case_line)
-    write(folder, rows, sheets)
+    results.add(run_items(runner, cases, 1), case_line, folder)
     if options.series:
         print(f"\n{SERIES_HEAD}")
-        run_items(runner, series, rows, sheets, series_line)
-        write(folder, rows, sheets)
+        results.add(run_items(runner, series, 1), series_line, folder)
     if options.mixes:
         mixes = make_mixes(cases, series, options.mixes)
         print(f"\n{len(mixes)} mixes:")
         # A coarse surface will do: only whether there is one counts.
         coarse = settings_of([*options.set, "dental.chart_density=5", "dental.cloud_spacing=1.0"])
-        runner = Runner(folder / "readings", options.threads, coarse)
-        for start in range(0, len(mixes), len(SORTS)):
-            run_items(runner, mixes[start : start + len(SORTS)], rows, sheets, mix_line)
-            write(folder, rows, sheets)
+        runner = Runner(folder / "readings", max(1, options.threads // options.jobs), coarse)
+        results.add(run_items(runner, mixes, options.jobs), mix_line, folder)
     print(f"\n{json.dumps(totals(rows), indent=1)}")
     found = thresholds(rows)
     print(

@@ -11,8 +11,9 @@ import hashlib
 import json
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -141,6 +142,9 @@ class Runner:
                 return self._from_views(outcome, settings, Path(scratch))
             except PipelineError as error:
                 return replace(outcome, message=str(error))
+            except Exception as error:  # said, and the other items still run
+                traceback.print_exc()
+                return replace(outcome, message=f"FAULT: {type(error).__name__}: {error}")
 
     def _from_views(self, outcome: Outcome, reader: dict[str, Any], scratch: Path) -> Outcome:
         views = outcome.views
@@ -219,11 +223,14 @@ class Runner:
         if not (folder / "reading.json").exists():
             started = time.perf_counter()
             made = read()
-            folder.mkdir(parents=True, exist_ok=True)
-            Teeth((made.dentition,)).save(folder)
             rest = {f.name: getattr(made, f.name) for f in fields(made) if f.name != "dentition"}
             entry = {"seconds": time.perf_counter() - started, "reading": rest}
-            (folder / "reading.json").write_text(json.dumps(entry))
+            self._readings.mkdir(parents=True, exist_ok=True)
+            new = Path(tempfile.mkdtemp(dir=self._readings))
+            Teeth((made.dentition,)).save(new)
+            (new / "reading.json").write_text(json.dumps(entry))
+            with suppress(OSError):  # another process may have read it meanwhile
+                new.rename(folder)
         else:
             self._reading_seconds += json.loads((folder / "reading.json").read_text())["seconds"]
         rest = json.loads((folder / "reading.json").read_text())["reading"]

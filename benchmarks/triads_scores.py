@@ -12,7 +12,7 @@ import numpy.typing as npt
 from triads_data import CASE, FRONTS, SERIES, SIDES, SWAPPED, Item, Photo, TruthPoint
 from triads_run import Outcome
 
-from pipeline.artifacts.fdi import JAWS
+from pipeline.artifacts.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
 
 if TYPE_CHECKING:
@@ -90,7 +90,9 @@ def _chosen(outcome: Outcome) -> tuple[Dentition, ...]:
 
 
 def _zeros() -> dict[str, int]:
-    names = ("points", "found", "right", "wrong", "wrong_but_marked", "in_one_crown")
+    names = (
+        "points", "found", "right", "right_place", "wrong", "wrong_but_marked", "in_one_crown",
+    )  # fmt: skip
     return dict.fromkeys(names, 0)
 
 
@@ -106,8 +108,9 @@ def score_points(
         marked: numbers with more doubt than this are marked as doubtful.
 
     Returns:
-        The counts of `whole` and `partial` points (`in_one_crown`: with that of another tooth), and
-        the whole ones that carry a wrong number.
+        The counts of `whole` and `partial` points, and the whole ones that carry a wrong number.
+        `right_place`: the number, be it of the permanent tooth or of the primary one there;
+        `in_one_crown`: with the point of another tooth.
     """
     counts = {"whole": _zeros(), "partial": _zeros()}
     wrong = []
@@ -120,6 +123,8 @@ def score_points(
         count["found"] += bool(around)
         right = any(crown.number in point.numbers for crown in around)
         count["right"] += right
+        places = {permanent_of(number) for number in point.numbers}
+        count["right_place"] += any(permanent_of(c.number) in places for c in around if c.number)
         said = [crown for crown in around if crown.number]
         if said and not right:
             surest = min(said, key=lambda crown: crown.doubt)

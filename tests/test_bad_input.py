@@ -39,7 +39,7 @@ def call(workspace: Path, *arguments: str) -> tuple[int, str]:
     )  # fmt: skip
     assert "Traceback" not in done.stderr
     summary = pipeline.run(SAMPLES, workspace=workspace, stages=["views"])
-    assert [stage.action for stage in summary.stages] == ["cached"]
+    assert {stage.action for stage in summary.stages} == {"cached"}
     return done.returncode, done.stderr.strip().rpartition("\n")[2]
 
 

@@ -23,7 +23,7 @@ def done(sample_run: RunSummary) -> RunSummary:
 
 def test_every_stage_ran_and_told_its_figures(done: RunSummary) -> None:
     assert [stage.name for stage in done.stages] == [
-        "views", "init", "align", "sap", "flow", "fit", "export", "evaluate"
+        "views", "teeth", "init", "align", "sap", "flow", "fit", "export", "evaluate"
     ]  # fmt: skip
     figures = {stage.name: stage.figures["summary"] for stage in done.stages}
     assert figures["init"]["views_registered"] == figures["init"]["views_total"] == 3
@@ -79,7 +79,9 @@ def test_second_run_is_cached_and_a_setting_reruns_only_what_depends_on_it(
     short = "fit.iterations=5"
     assert actions(short, **chain)["fit"] == "ran"
     changed = actions(short, "sap.quantile=0.99", **chain)
-    assert changed == {"views": "cached", "init": "cached", "sap": "ran", "fit": "ran"}
+    assert changed == {
+        "views": "cached", "teeth": "cached", "init": "cached", "sap": "ran", "fit": "ran",
+    }  # fmt: skip
     states = {s.name: s for s in pipeline.status(workspace=done.workspace)}
     assert states["sap"].reasons == ["sap.quantile 0.999 → 0.99"]
     assert states["fit"].reasons == ["input points (from sap) changed"]

@@ -34,7 +34,8 @@ NOTES = {
     "doubt": "0..1, that the number is wrong: of a tooth, the least of its photographs",
     "centre": "middle of what the photographs show of the crown's front, in the frame of all "
     "exports (scene.json); null: nothing is known of its depth",
-    "spread": "largest distance between that middle as single photographs have it and the centre",
+    "spread": "largest distance between that middle as single photographs have it and the centre; "
+    "null: one photograph at most",
     "outline": "closed polygon in pixels of colmap/images/PHOTOGRAPH.png, x to the right, y down, "
     "pixel centres at .5",
 }
@@ -138,7 +139,7 @@ def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array
     if not view.lens_taken_out:
         return np.asarray(scaled, np.float64)
     from stages.geometry.colmap import quiet_pycolmap
-    from stages.geometry.known_cameras import KnownCamera, _working_from_lens, pinhole_camera
+    from stages.geometry.known_cameras import KnownCamera, pinhole_camera, working_pixels_from_lens
 
     model, width, height, *parameters = view.lens_taken_out.split()
     lens = quiet_pycolmap().Camera(
@@ -147,7 +148,7 @@ def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array
     )  # fmt: skip
     known = KnownCamera(view.name, lens, np.eye(4))
     camera = pinhole_camera(view, known)
-    lens_from_working = np.linalg.inv(_working_from_lens(view, known, "teeth.json"))
+    lens_from_working = np.linalg.inv(working_pixels_from_lens(view, known, "teeth.json"))
     pixels = scaled @ lens_from_working[:2, :2].T + lens_from_working[:2, 2]
     rays = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
     # `pinhole_camera` turns the lens's axes to those of the upright image.
@@ -179,13 +180,17 @@ def _tooth(crowns: Sequence[SeenCrown]) -> dict[str, Any]:
 
 
 def joint_centre(crowns: Sequence[SeenCrown]) -> tuple[Array | None, float | None]:
-    """[3] mean of a tooth's centres by the pixels that show it, and how far they lie from it."""
+    """[3] mean of a tooth's centres by the pixels that show it, and how far they lie from it.
+
+    The latter is None with fewer than two centres, both with none.
+    """
     known = [crown for crown in crowns if crown.centre is not None]
     if not known:
         return None, None
     centres = np.array([crown.centre for crown in known])
     mean = np.average(centres, axis=0, weights=[crown.pixels for crown in known])
-    return mean, float(np.linalg.norm(centres - mean, axis=1).max())
+    spread = np.linalg.norm(centres - mean, axis=1).max() if len(known) > 1 else None
+    return mean, spread
 
 
 def _photograph(

@@ -221,7 +221,7 @@ def pinhole_camera(view: View, known: KnownCamera, setting: str = SETTING) -> Ca
         RequestError: the lens's image has another shape than the photograph.
     """
     lens = known.lens
-    working_from_lens = _working_from_lens(view, known, setting)
+    working_from_lens = working_pixels_from_lens(view, known, setting)
     linear = working_from_lens[:2, :2]
     focal = np.abs(linear) @ np.array([lens.focal_length_x, lens.focal_length_y])
     centre = working_from_lens @ np.array([lens.principal_point_x, lens.principal_point_y, 1.0])
@@ -251,7 +251,7 @@ def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[
     """
     lens = known.lens
     camera = pinhole_camera(view, known, setting)
-    working_from_lens = _working_from_lens(view, known, setting)
+    working_from_lens = working_pixels_from_lens(view, known, setting)
     turn = _turn(working_from_lens)
     distortion = [lens.params[index] for index in lens.extra_params_idxs()]
     if not np.any(np.abs(distortion) > 1e-9):
@@ -295,7 +295,7 @@ def rounded(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
     return to_uint8(image).astype(np.float32) / np.float32(255)
 
 
-def _working_from_lens(view: View, known: KnownCamera, setting: str) -> Array:
+def working_pixels_from_lens(view: View, known: KnownCamera, setting: str) -> Array:
     """[3, 3] affine map from the pixels of the model's image to the view's."""
     lens = known.lens
     width, height = view.source_size if min(view.source_size) > 0 else (view.width, view.height)

@@ -15,7 +15,10 @@ from stages.teeth.read import Reading, row_extent
 Array32 = npt.NDArray[np.float32]
 
 #: Words for the kinds that are set aside.
-_OCCLUSAL = {"upper": "the biting surfaces of the upper jaw", "lower": "those of the lower jaw"}
+_OCCLUSAL = {
+    "upper": "the biting surfaces of the upper jaw",
+    "lower": "the biting surfaces of the lower jaw",
+}
 #: Photographs are compared in numbers that so many crowns have in common.
 _COMMON_CROWNS = 5
 #: Long side to which sharpness is compared.
@@ -30,8 +33,7 @@ class ChoiceOptions:
     least_extent: float = 0.3
     least_colour: float = 4.0
     same_view: float = 0.06
-    apart_gap: float = 0.08
-    apart_sure: float = 0.5
+    apart_gap: float = 0.3
 
 
 def choose(
@@ -69,16 +71,13 @@ def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
     if row_extent(dentition) < options.least_extent:
         return "the teeth are too small in it: a face, or taken from too far away"
     occlusal = {kind: reading.kinds[kind] for kind in _OCCLUSAL}
-    likely = max(occlusal, key=lambda kind: occlusal[kind])
+    jaw = max(occlusal, key=lambda kind: occlusal[kind])
     rows = (len(dentition.upper), len(dentition.lower))
-    if occlusal[likely] > 0.5:
-        return f"it shows {_OCCLUSAL[likely]}"
+    if sum(occlusal.values()) > 0.5:
+        return f"it shows {_OCCLUSAL[jaw]}"
     if min(rows) <= 1 and max(rows) >= options.least_crowns and reading.kinds["other"] > 0.5:
         return "it shows one jaw only"
-    gap = dentition.jaws_apart
-    if gap > 2 * options.apart_gap or (
-        gap > options.apart_gap and reading.apart > options.apart_sure
-    ):
+    if reading.apart > 0.5 or dentition.jaws_apart > options.apart_gap:
         return "the jaws are apart in it"
     return ""
 
@@ -102,13 +101,18 @@ def _repeated(
         for other in sorted(usable, key=lambda k: -worth[k]):
             if other == k:
                 break
-            if other in result:
+            if other in result or likely(readings[k]) != likely(readings[other]):
                 continue
             off = layout_distance(readings[k].dentition, readings[other].dentition)
             if off is not None and off < options.same_view:
                 result[k] = f"it shows the same as {names[other]}, which is clearer"
                 break
     return result
+
+
+def likely(reading: Reading) -> str:
+    """From the front or from which side a photograph is likeliest taken."""
+    return max(("front", "right", "left"), key=lambda kind: reading.kinds[kind])
 
 
 def _worth(reading: Reading, image: Array32) -> float:

@@ -16,6 +16,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
 
@@ -26,6 +27,16 @@ def rigid(rng: np.random.Generator) -> np.ndarray:
     pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
     pose[:3, 3] = rng.normal(size=3)
     return pose
+
+
+def crown() -> Crown:
+    """One with a landmark missing."""
+    corners = np.array([[1.0, 1.25], [4, 1.25], [4, 3.75], [1, 3.75]])
+    ends = np.array([[2.5, 1.25], [2.5, 3.75], [4.0, 2.5]])
+    return Crown(
+        "upper", ends[0], ends[1], None, ends[2], None, None, 3.0, 2.5,
+        outline=corners, score=0.5, numbers={11: 0.75, 51: 0.25}, number=11, doubt=0.125,
+    )  # fmt: skip
 
 
 def samples() -> dict[str, Artifact]:
@@ -74,6 +85,13 @@ def samples() -> dict[str, Artifact]:
             Light(floats(9, 3), floats(9, 3), 0.9, 2.1, 1.3, (97.0, 15.5), (0.45, 0.04)),
         ),
         "metrics": Metrics({"mean": {"psnr": 31.25}, "unplaced": []}),
+        "teeth": Teeth(
+            (
+                Dentition("000", (7, 5), "front", (crown(),), roll=np.radians(-3.5)),
+                Dentition("001", (6, 8), "none", set_aside="no teeth"),
+            ),
+            {"000": rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)},
+        ),
         "pictures": Pictures({"matches": rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)}),
     }
 

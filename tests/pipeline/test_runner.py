@@ -249,3 +249,13 @@ def test_workspace_remembers_its_photographs(run: Any) -> None:
     run()
     assert run("scale.factor=5", images=()) == {"scale": "ran", "count": "ran", "publish": "ran"}
     assert run("read.keep=1", images=(), stages=["read", "scale"])["read"] == "ran"
+
+
+def test_what_prepares_runs_after_what_reads_and_before_the_rest(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toy.ScaleStage.prepares", True)
+    assert next(iter(run(stages=["read"]))) == "read"
+    assert list(run(stages=["count"])) == ["read", "scale", "count"]
+    assert list(run(stages=["read", "count"])) == ["read", "scale", "count"]
+    assert list(run(stages=["publish"], images=())) == ["publish"]

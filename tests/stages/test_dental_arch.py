@@ -22,6 +22,7 @@ from stages.init.dental.template import (
     is_lower_landmark,
     landmark_index,
     landmark_names,
+    position_of,
     textbook_arch,
     tooth_at,
 )
@@ -73,7 +74,7 @@ def photograph(
             across = flat[right, 0] - flat[left, 0] if 0 < position < 13 else 20.0
             zenith = pixels[landmark_index(jaw, ZENITH, position)]
             inside = 8 < zenith[0] < WIDTH - 8 and 8 < zenith[1] < HEIGHT - 8
-            if across > 6 and inside:
+            if across > 9 and inside:
                 shown.append(position)
         first = max((p for p in shown if p - 1 not in shown and p <= 7), default=shown[0])
         shown = [p for p in shown if p >= first]
@@ -134,7 +135,7 @@ def rotation_errors(result, poses: list[np.ndarray]) -> list[float]:
 
 
 def three(yaws: tuple[float, ...] = (-42.0, 0.0, 42.0), rolls: tuple[float, ...] = (0, 0, 0)):
-    points = patient(1)
+    points = patient(4)
     shots = [
         photograph(points, y, r, seed=i) for i, (y, r) in enumerate(zip(yaws, rolls, strict=True))
     ]
@@ -158,6 +159,30 @@ def test_closed_gap_moves_the_teeth_behind_it_forward() -> None:
     before = landmark_index("upper", ZENITH, 4)  # 13
     assert np.linalg.norm(closed[behind] - open_[behind]) > 4
     np.testing.assert_allclose(closed[before], open_[before], atol=0.5)
+
+
+def test_primary_teeth_are_smaller_and_the_rest_moves_up() -> None:
+    """Widths between embrasures, mm, of Wheeler's tables."""
+    milk = frozenset({11, 12, 13, 14, 15, 21, 22, 23, 24, 25})
+    permanent, primary = textbook_arch(), textbook_arch(frozenset(), milk)
+
+    def width(points: np.ndarray, jaw: str, tooth: int) -> float:
+        at = position_of(tooth)
+        ends = [landmark_index(jaw, EMBRASURE, at + k) for k in (-1, 0)]  # type: ignore[arg-type]
+        return float(np.linalg.norm(points[ends[1]] - points[ends[0]]))
+
+    for tooth, wide, narrow in ((11, 8.5, 6.5), (12, 6.5, 5.1), (25, 6.8, 8.2)):
+        assert width(permanent, "upper", tooth) == pytest.approx(wide, rel=0.12)
+        assert width(primary, "upper", tooth) == pytest.approx(narrow, rel=0.12)
+    # A primary canine among permanent incisors: what lies before it stays, what lies behind moves.
+    one = textbook_arch(frozenset(), frozenset({23}))
+    before, behind = (landmark_index("upper", TIP, position_of(t)) for t in (22, 24))
+    np.testing.assert_array_equal(one[before], permanent[before])
+    assert 0.3 < np.linalg.norm(one[behind] - permanent[behind]) < 1.0
+    lower = is_lower_landmark()
+    np.testing.assert_array_equal(primary[lower], permanent[lower])
+    zenith, tip = (landmark_index("upper", kind, position_of(11)) for kind in (ZENITH, TIP))
+    assert primary[zenith, 1] - primary[tip, 1] == pytest.approx(6.0, abs=0.3)
 
 
 def test_gradients_agree_with_finite_differences() -> None:
@@ -236,7 +261,7 @@ def test_roll_is_taken_out_and_put_back() -> None:
     dentitions, poses, teeth = three(rolls=(0.35, -0.2, 0.3))
     result = fit(dentitions, ArchOptions())
     assert [view.upper for view in result.views] == [upper for upper, _ in teeth]
-    assert max(rotation_errors(result, poses)) < 4
+    assert max(rotation_errors(result, poses)) < 7  # fewer crowns fit into turned pictures
 
 
 def test_known_focal_lengths_are_held() -> None:

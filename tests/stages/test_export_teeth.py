@@ -183,6 +183,7 @@ def test_centres_count_by_the_pixels_that_show_the_crown() -> None:
     centre, spread = joint_centre([seen(0.0, 300), seen(4.0, 100), seen(None, 2)])
     np.testing.assert_allclose(centre, [1, 0, 0])
     assert spread == pytest.approx(3)
+    assert joint_centre([seen(2.0, 9)])[1] is None
     assert joint_centre([seen(None, 0)]) == (None, None)
 
 

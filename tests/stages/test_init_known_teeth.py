@@ -8,10 +8,10 @@ import pytest
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
-from stages.init import known_teeth, stage
+from stages.init import known_teeth
 from stages.init.config import InitConfig
 from stages.init.stage import InitStage
-from tests.stages.test_init_teeth import FOCAL, SIZE, found_teeth, side_pose
+from tests.stages.test_init_teeth import FOCAL, SIZE, found_teeth, read_teeth, side_pose
 
 UNIT = 0.02  # of the cameras' world per mm of the arch
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -55,8 +55,8 @@ def run(tmp_path, monkeypatch, path, found, likely=True, **settings):
     """The stage with the teeth as given (an exception is raised), and what it was asked."""
     asked = {}
 
-    def reconstruct(views, names, focals, *_, cameras, **__):
-        asked.update(views=views, focals=focals, cameras=cameras)
+    def reconstruct(views, names, dentitions, focals, *_, cameras, **__):
+        asked.update(views=views, dentitions=dentitions, focals=focals, cameras=cameras)
         if isinstance(found, Exception):
             raise found
         return found
@@ -66,10 +66,10 @@ def run(tmp_path, monkeypatch, path, found, likely=True, **settings):
 
     monkeypatch.setattr(known_teeth, "reconstruct_teeth", reconstruct)
     monkeypatch.setattr("stages.init.place.place_known", sweep)
-    monkeypatch.setattr(stage, "_teeth_are_worth_a_try", lambda *_: likely)
     config = InitConfig(cameras=str(path), **settings)
+    inputs = {"views": photographs()} | ({"teeth": read_teeth()} if likely else {})
     context = LocalContext(
-        config, tmp_path, inputs={"views": photographs()},
+        config, tmp_path, inputs=inputs,
         sources=InitStage().sources(config, {}), threads=1,
     )  # fmt: skip
     return context, asked
@@ -87,6 +87,13 @@ def test_cameras_stay_as_given_and_the_surface_lies_before_them(tmp_path, monkey
     context, asked = run(tmp_path, monkeypatch, transforms(tmp_path, cx=cx), teeth)
     InitStage().run(context)
     assert asked["focals"] == [FOCAL] * 3
+    for before, after in zip(read_teeth().views, asked["dentitions"], strict=True):
+        # The crowns lie where the picture has them that has its principal point in the middle.
+        shift = np.array([after.size[0] / 2 - cx, 0])
+        assert after.name == before.name
+        for crown, centred in zip(before.all_crowns, after.all_crowns, strict=True):
+            np.testing.assert_allclose(centred.outline, crown.outline + shift, atol=1e-9)
+            assert (centred.number, centred.doubt) == (crown.number, crown.doubt)
     cameras = context.result("cameras")
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
     for camera, yaw, given in zip(cameras.cameras, (-40, 0, 40), asked["cameras"], strict=True):

@@ -1,18 +1,19 @@
 """From the dental path's result to the stage's outputs, and when that path is chosen."""
 
-from pathlib import Path
+from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
+from pipeline.artifacts.fdi import is_upper
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init import teeth
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.landmarks import Landmark
-from stages.init.dental.reconstruct import Teeth
+from stages.init.dental.reconstruct import Reconstruction, with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, SurfaceView
@@ -45,6 +46,37 @@ def ball_depth(pose, radius=20.0):
     return depth.astype(np.float32)
 
 
+#: FDI number of each crown of a photograph as all photographs together have it, 0: no tooth.
+UPPER, LOWER = (12, 11, 21), (41, 0, 31)
+
+
+def read_teeth(count=3, aside=(), numbers=UPPER):
+    """What the stage `teeth` hands over: three crowns a row, 20 pixels wide; numbers in doubt."""
+    dentitions = []
+    for k in range(count):
+        rows = {}
+        for jaw, top, teeth_of_row in (("upper", 20, numbers), ("lower", 50, LOWER)):
+            crowns = []
+            for place, number in enumerate(teeth_of_row):
+                left = 30 + 20 * place
+                corners = np.add([[0, 0], [19, 0], [19, 28], [0, 28]], [left, top])
+                top_middle = np.array([left + 9.5, top])
+                crowns.append(
+                    Crown(
+                        jaw, top_middle, top_middle + np.array([0, 28]), *[None] * 4, 19.0, 28.0,
+                        outline=corners.astype(float), number=number, doubt=0.4,
+                    )
+                )  # fmt: skip
+            rows[jaw] = tuple(crowns)
+        dentitions.append(
+            Dentition(
+                f"{k:03d}", SIZE[::-1], "front", rows["upper"], rows["lower"], 0.0, 58.0,
+                set_aside="it shows one jaw only" if k in aside else "",
+            )
+        )  # fmt: skip
+    return Teeth(tuple(dentitions))
+
+
 def found_teeth(yaws=(-40, 0, 40), widths=()):
     poses = [side_pose(yaw) for yaw in yaws]
     maps = [ball_depth(pose) for pose in poses]
@@ -67,12 +99,16 @@ def found_teeth(yaws=(-40, 0, 40), widths=()):
         Landmark("embrasure", 11, 21): np.array([0.0, 0, 0]),
     }
     views = tuple(
-        PlacedView(pose, FOCAL, role, (12, 11, 21), (41, 0, 31), 0.5)
+        PlacedView(pose, FOCAL, role, UPPER, LOWER, 0.5, (0.1, 0.0, 0.0), (0.0, 1.0, 0.0))
         for pose, role in zip(poses, ("right", "frontal", "left"), strict=True)
     )
     fit = ArchFit(views, landmarks, landmarks, margin=40.0)
     picture = np.zeros((20, 30, 3), np.uint8)
-    return Teeth([None] * len(yaws), fit, surface, {"teeth": picture, "turned": picture})
+    numbered = [
+        with_numbers(dentition, view, fit)
+        for dentition, view in zip(read_teeth(len(yaws)).views, views, strict=True)
+    ]
+    return Reconstruction(numbered, fit, surface, {"teeth": picture, "turned": picture})
 
 
 def photographs(count=3):
@@ -82,10 +118,20 @@ def photographs(count=3):
     )
 
 
-def run(tmp_path, monkeypatch, found, **dental):
-    monkeypatch.setattr(teeth, "reconstruct_teeth", lambda *args, **kwargs: found)
+def run(tmp_path, monkeypatch, found, read=None, asked=None, **dental):
+    """The stage with the reconstruction as given (an exception is raised); what it was asked."""
+
+    def reconstruct(views, names, dentitions, *args, **kwargs):
+        if asked is not None:
+            asked.extend(dentitions)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    monkeypatch.setattr(teeth, "reconstruct_teeth", reconstruct)
     config = InitConfig(method="dental", dental=dental)
-    context = LocalContext(config, tmp_path, inputs={"views": photographs()}, threads=1)
+    inputs = {"views": photographs(), "teeth": read or read_teeth()}
+    context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
     InitStage().run(context)
     return context
 
@@ -146,88 +192,132 @@ def test_known_tooth_width_gives_the_scale(tmp_path, monkeypatch):
     assert not any("textbook" in warning for warning in context.warnings)
 
 
-def test_settings_reach_the_fit_in_working_pixels():
+def test_the_numbers_of_all_photographs_together_are_handed_on(tmp_path, monkeypatch):
+    context = run(tmp_path, monkeypatch, found_teeth())
+    for view in context.result("teeth").views:
+        assert tuple(crown.number for crown in view.upper) == UPPER
+        assert tuple(crown.number for crown in view.lower) == LOWER
+        assert [crown.doubt for crown in view.upper] == [0.1, 0.0, 0.0]
+
+
+def test_primary_teeth_get_their_own_numbers_and_what_a_person_said_is_not_doubted():
+    found = found_teeth()
+    object.__setattr__(found.fit, "primary", frozenset({12, 41}))
+    said = replace(read_teeth().views[0].upper[0], doubt=0.0)
+    before = replace(read_teeth().views[0], upper=(said, *read_teeth().views[0].upper[1:]))
+    after = with_numbers(before, found.fit.views[0], found.fit)
+    assert [crown.number for crown in after.upper] == [52, 11, 21]
+    assert [crown.number for crown in after.lower] == [81, 0, 31]
+    assert [crown.doubt for crown in after.upper] == [0, 0, 0]
+    assert with_numbers(before, None, found.fit) is before
+
+
+def test_photographs_set_aside_take_no_part_unless_their_order_is_given(tmp_path, monkeypatch):
+    asked = []
+    read = read_teeth(aside=(1,))
+    run(tmp_path / "a", monkeypatch, found_teeth(), read, asked)
+    assert [d and d.name for d in asked] == ["000", None, "002"]
+    asked.clear()
+    run(tmp_path / "b", monkeypatch, found_teeth(), read, asked, order="right,frontal,left")
+    assert [d.name for d in asked] == ["000", "001", "002"]
+
+
+def test_teeth_that_were_not_read_are_asked_for(tmp_path):
+    context = LocalContext(InitConfig(method="dental"), tmp_path, inputs={"views": photographs()})
+    with pytest.raises(RequestError, match="--stages teeth,init"):
+        InitStage().run(context)
+
+
+def test_a_refusal_brings_the_teeth_of_all_photographs_with_it(tmp_path, monkeypatch):
+    one = with_numbers(read_teeth().views[0], found_teeth().fit.views[0], found_teeth().fit)
+    refused = ReconstructionError("The teeth are odd.", {}, {"teeth": Teeth((one,))})
+    with pytest.raises(ReconstructionError) as caught:
+        run(tmp_path, monkeypatch, refused, read_teeth(numbers=(13, 12, 11)))
+    views = caught.value.artifacts["teeth"].views
+    assert [view.name for view in views] == ["000", "001", "002"]
+    assert [crown.number for crown in views[0].upper] == list(UPPER)
+    assert [crown.number for crown in views[1].upper] == [13, 12, 11]
+
+
+def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):
     views = photographs()
     large = View("000", views.views[0].image, source_name="p0.jpg", source_size=(1280, 960))
     views = Views((large, *views.views[1:]))
-    config = DentalConfig(
-        order="right, frontal,left",
-        labels=[{"photo": "p0", "x": 500, "y": 200, "tooth": 14}],
-        min_margin=21,
-    )
-    options = teeth.arch_options(config, views)
-    assert options.order == ("right", "frontal", "left") and options.min_margin == 21
-    hint = options.labels[0]
-    assert (hint.photo, hint.x, hint.y, hint.tooth) == (0, 50, 20, 14)
+
+    def said(**hint):
+        labels = [{"photo": "p0", "x": 600, "y": 300, "tooth": 14, **hint}]
+        config = InitConfig(method="dental", dental={"labels": labels})
+        inputs = {"views": views, "teeth": read_teeth()}
+        context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
+        return teeth.labelled_teeth(context, views)
+
+    (crown,) = [c for c in said().views[0].all_crowns if c.doubt == 0]
+    assert (crown.number, crown.jaw) == (14, "upper")
+    assert crown.centre == pytest.approx([59.5, 34])
+    assert all(is_upper(c.number) == (c.jaw == "upper") for c in said(tooth=44).views[0].upper)
+    with pytest.raises(RequestError, match="no crown at 5, 5"):
+        said(x=5, y=5)
+    with pytest.raises(RequestError, match="no photograph 'q0'"):
+        said(photo="q0")
+
+
+def test_settings_reach_the_fit():
+    views = photographs()
+    options = teeth.arch_options(DentalConfig(order="right, frontal,left", min_margin=21), views)
+    assert options.order == ("right", "frontal", "left")
+    assert options.min_margin == 21
     with pytest.raises(RequestError, match="names 2 photographs"):
         teeth.arch_options(DentalConfig(order="right,left"), views)
-    with pytest.raises(RequestError, match="there is no tooth 18"):
-        labels = [{"photo": "p0", "x": 1, "y": 1, "tooth": 18}]
-        teeth.arch_options(DentalConfig(labels=labels), views)
-    with pytest.raises(RequestError, match="no photograph 'q0'"):
-        labels = [{"photo": "q0", "x": 1, "y": 1, "tooth": 11}]
-        teeth.arch_options(DentalConfig(labels=labels), views)
     assert teeth.surface_options(DentalConfig(gum_height=2)).gum_height == 2
 
 
-def unmatchable(count=3):
+@pytest.fixture
+def no_features(monkeypatch):
     """Photographs that share nothing."""
-    images = []
-    for seed in range(count):
-        rng = np.random.default_rng(seed)
-        gray = cv2.GaussianBlur(rng.uniform(size=(192, 256)), (0, 0), 2)
-        gray = (gray - gray.min()) / np.ptp(gray)
-        images.append(np.repeat(gray[..., None], 3, 2).astype(np.float32))
-    return Views(tuple(View(f"{k:03d}", image) for k, image in enumerate(images)))
+
+    def unplaced(*_, **__):
+        raise ReconstructionError("0 of 3 photographs could be placed.")
+
+    monkeypatch.setattr("stages.init.place.place_classical", unplaced)
 
 
-def auto(tmp_path, views, **config):
-    context = LocalContext(InitConfig(**config), tmp_path, inputs={"views": views}, threads=2)
+def auto(tmp_path, count, read=None, **config):
+    inputs = {"views": photographs(count)} | ({"teeth": read} if read else {})
+    context = LocalContext(InitConfig(**config), tmp_path, inputs=inputs, threads=1)
     InitStage().run(context)
     return context
 
 
-def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch):
+def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch, no_features):
     tried = []
     monkeypatch.setattr("stages.init.teeth.from_teeth", lambda context, views: tried.append(1))
-    with pytest.raises(ReconstructionError, match="could be placed"):
-        auto(tmp_path / "landscape", unmatchable())  # no teeth to be seen
+    none = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], "none") for k in range(3)))
+    refused = [
+        ("unread", 3, None, {}),
+        ("landscape", 3, none, {}),
+        ("features", 3, read_teeth(), {"method": "colmap"}),
+        ("pair", 2, read_teeth(2), {}),
+        ("aside", 3, read_teeth(aside=(0,)), {}),
+    ]
+    for name, count, read, settings in refused:
+        with pytest.raises(ReconstructionError, match="could be placed"):
+            auto(tmp_path / name, count, read, **settings)
     assert not tried
-    monkeypatch.setattr("stages.init.dental.photo.teeth_likely", lambda *a, **k: True)
-    auto(tmp_path / "teeth", unmatchable())
+    auto(tmp_path / "teeth", 3, read_teeth())
     assert tried == [1]
-    with pytest.raises(ReconstructionError):
-        auto(tmp_path / "features", unmatchable(), method="colmap")
-    with pytest.raises(ReconstructionError):
-        auto(tmp_path / "pair", unmatchable(2))
-    assert tried == [1]
+    auto(tmp_path / "more", 4, read_teeth(4, aside=(3,)))
+    assert tried == [1, 1]
 
 
-def test_both_diagnoses_are_told_and_the_pictures_kept(tmp_path, monkeypatch):
+def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypatch, no_features):
     picture = {"teeth": np.zeros((4, 4, 3), np.uint8)}
+    read = {"teeth": read_teeth()}
 
     def doubtful(context, views):
-        raise ReconstructionError("Photo 1 and 2 hardly agree.", picture)
+        raise ReconstructionError("Photo 1 and 2 hardly agree.", picture, read)
 
     monkeypatch.setattr("stages.init.teeth.from_teeth", doubtful)
-    monkeypatch.setattr("stages.init.dental.photo.teeth_likely", lambda *a, **k: True)
     with pytest.raises(ReconstructionError, match=r"could be placed.*hardly agree") as caught:
-        auto(tmp_path, unmatchable())
+        auto(tmp_path, 3, read_teeth())
     assert caught.value.pictures == picture
-
-
-REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("folder", ["castle", "berlin"])
-def test_other_photographs_are_never_taken_for_teeth(folder):
-    from stages.init.dental.photo import teeth_likely
-
-    if not REAL_DATA.exists():
-        pytest.skip("the real photographs are not here")
-    images = []
-    for path in sorted((REAL_DATA / folder / "images").iterdir())[:4]:
-        image = cv2.resize(cv2.imread(str(path)), (512, 384), interpolation=cv2.INTER_AREA)
-        images.append(image[..., ::-1].astype(np.float32) / np.float32(255))
-    assert not teeth_likely(images, [np.ones((384, 512), bool)] * len(images))
+    assert caught.value.artifacts == read

@@ -22,6 +22,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 
+#: Primary teeth are rarer among the photographs than among children: each counts as so many.
+PRIMARY_WEIGHT = 4.0
+
+
 class Stream(torch.utils.data.IterableDataset):
     """Endless random examples: real photographs, those with numbers more often; generated ones."""
 
@@ -71,9 +75,9 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
     count = chosen.sum().clamp(min=1)
     quadrant, place = number // 10, number % 10
 
-    def binary(channel: int, truth: Tensor) -> Tensor:
+    def binary(channel: int, truth: Tensor, weight: float = 1.0) -> Tensor:
         wrong = F.binary_cross_entropy_with_logits(
-            answer[:, channel], truth.float(), reduction="none"
+            answer[:, channel], truth.float(), reduction="none", pos_weight=torch.tensor(weight)
         )
         return (wrong * chosen).sum() / count
 
@@ -90,7 +94,7 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
         "jaw": 0.3 * binary(JAW, (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)),
         "side": 0.3
         * binary(SIDE, (quadrant == 2) | (quadrant == 3) | (quadrant == 6) | (quadrant == 7)),
-        "primary": 0.15 * binary(PRIMARY, quadrant >= 5),
+        "primary": 0.3 * binary(PRIMARY, quadrant >= 5, PRIMARY_WEIGHT),
         "position": 0.3 * position / count,
     }
     if (batch["view"] >= 0).any():
@@ -139,6 +143,7 @@ def main() -> None:
     parser.add_argument("--mouths", type=Path, help="folder of generated mouths")
     parser.add_argument("--share", type=float, default=0.3, help="share of generated mouths")
     parser.add_argument("--out", type=Path, default=Path("reader.pt"))
+    parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--steps", type=int, default=9000)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--rate", type=float, default=3e-3)
@@ -161,6 +166,8 @@ def main() -> None:
     )  # fmt: skip
     net = Reader().to(memory_format=torch.channels_last)
     print(f"{sum(p.numel() for p in net.parameters()) / 1e6:.2f} million weights", flush=True)
+    if arguments.start:
+        net.load_state_dict(torch.load(arguments.start, weights_only=True))
     average = copy.deepcopy(net).eval()
     optimiser = torch.optim.AdamW(net.parameters(), arguments.rate, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(

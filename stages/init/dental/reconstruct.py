@@ -24,6 +24,8 @@ Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 
+#: With fewer photographs nothing contradicts a wrong numbering.
+LEAST_PHOTOGRAPHS = 3
 HOW_TO_SHOOT_TEETH = (
     "Take one photograph from the front and one from each side, 30 to 45 degrees apart, with the "
     "lips drawn back so that the gum line of all teeth shows, all sharp and at the same zoom; or a "
@@ -70,10 +72,12 @@ def reconstruct_teeth(
     images = [view.image for view in views]
     valid = [view.valid() for view in views]
     found = sum(dentition is not None for dentition in dentitions)
-    if found < 2:
+    if found < (2 if accept_doubtful or cameras is not None else LEAST_PHOTOGRAPHS):
         raise ReconstructionError(
-            f"Rows of teeth could be made out in {found} of {len(views)} photographs; three are "
-            f"needed. {HOW_TO_SHOOT_TEETH}"
+            f"Rows of closed teeth, seen from the front or a side, were made out in {found} of "
+            f"{len(views)} photographs; three are needed. {HOW_TO_SHOOT_TEETH}",
+            labelled(views, dentitions) if found else {},
+            {"teeth": Teeth(tuple(d for d in dentitions if d is not None))} if found else {},
         )
     fit = fit_arch(dentitions, images, valid, focals, arch, threads, progress, names, cameras)
     numbered = [

@@ -56,7 +56,7 @@ Progress = Callable[[str, int, int], None]
 #: A photograph needs this many crowns in all to be placed.
 MIN_CROWNS = 4
 #: Labellings from the search that edits start from, where they are this near the best.
-EDITED, EDIT_WINDOW = 6, 60.0
+EDITED, EDIT_WINDOW = 3, 40.0
 #: Then labellings shifted by a tooth that are no more than this worse are edited too, so often.
 SHIFTS, EDIT_GAP = 3, 30.0
 #: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
@@ -111,8 +111,8 @@ def fit_arch(
     placeable = []
     for index, dentition in enumerate(dentitions):
         if dentition is None:
-            doubts.append(f"{names[index]} could not be placed: no row of teeth was found in it")
-        elif len(dentition.upper) + len(dentition.lower) < MIN_CROWNS:
+            continue
+        if len(dentition.upper) + len(dentition.lower) < MIN_CROWNS:
             doubts.append(f"{names[index]} could not be placed: it shows too few crowns")
         else:
             placeable.append(index)
@@ -127,16 +127,15 @@ def fit_arch(
     fixed = _fixed_labels(read)
     focal, deviation = _focal_priors([focals[i] for i in placeable], read, options)
     rows = [seen_rows(dentition) for dentition in read]
-    primary = primary_teeth(read, rows)
     shown = [names[i] for i in placeable]
 
     rolls = [dentition.roll for dentition in read]
     held = None if cameras is None else held_cameras([cameras[i] for i in placeable], rolls)
-    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held, primary)
+    scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held)
     best, others = _label(scorer, fixed, progress)
     if inner.order is not None:
         best, others, scorer, contradiction = _keep_order(
-            Scorer(rows, focal, deviation, inner, threads, held, primary), fixed, scorer, best,
+            Scorer(rows, focal, deviation, inner, threads, held), fixed, scorer, best,
             others, shown, progress,
         )  # fmt: skip
         doubts += contradiction
@@ -144,6 +143,10 @@ def fit_arch(
         doubts += _role_doubts(best)
     gaps = margins(best, others)
     shares = label_doubts(best, others)
+    primary = primary_teeth(scorer, best, read)
+    if primary:
+        start = (best.adjusted.unknowns, best.adjusted.offsets)
+        best = scorer.solve(replace(best.labelling, primary=primary), start)
     common = common_mouth(scorer, best)
 
     best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],

@@ -34,6 +34,8 @@ Doubts = tuple[float, ...]
 TRIED_DEVIATION = 0.8
 #: Edits of a row that look best against that arch and are solved jointly.
 JOINT_TRIALS = 12
+#: Edits of a photograph that look likeliest and are tried against the other views' arch.
+ROW_TRIALS = 24
 #: Steps of the solver for such a trial.
 TRIAL_STEPS = 6
 #: An edit must gain this much to be taken.
@@ -42,6 +44,10 @@ MIN_GAIN = 1.0
 MAX_EDITS = 6
 #: Labellings next to the best that are solved to the end, to know the margin.
 NEAREST = 5
+#: Labellings that look less likely than the present one by more than this (evidence) are not tried.
+LOOKS_WINDOW = 60.0
+#: No number is surer than this: a doubt of 0 means that a person has said it.
+LEAST_DOUBT = 1e-4
 #: Labellings count as different ones when they name more crowns differently than this.
 SAME_BUT_FOR = 2
 
@@ -68,7 +74,11 @@ def row_edits(labels: Labels) -> list[Labels]:
             continue
         edits.add(contiguous(label - i, count))
         if i in (0, count - 1):
-            continue  # a row's ends are cut off and show little more than the neighbours' papillae
+            # A row's end may be the next tooth but one, the one between hidden; or none.
+            outward = -1 if i == 0 else 1
+            for other in (label + outward, label - outward, NO_TOOTH):
+                edits.add(_bounded([*labels[:i], other, *labels[i + 1 :]]))
+            continue
         for side in (-1, 1):
             beyond = [(k - i) * side > 0 for k in range(count)]
             if any(beyond):
@@ -168,6 +178,21 @@ def without_view(scorer: Scorer, scored: Scored, number: int) -> Scored:
     return scorer.solve(fewer, (unknowns, scored.adjusted.offsets), SEARCH_STEPS)
 
 
+def plausible(
+    scorer: Scorer, now: Labelling, edits: list[Labelling], most: int | None = None
+) -> list[Labelling]:
+    """Those of some labellings that the crowns' looks don't rule out beside the present one.
+
+    Args:
+        most: so many that look likeliest, in their order; None: all.
+    """
+    limit = scorer.looks(now) + LOOKS_WINDOW
+    looks = [scorer.looks(edit) for edit in edits]
+    if most is not None and len(looks) > most:
+        limit = min(limit, sorted(looks)[most])
+    return [edit for edit, cost in zip(edits, looks, strict=True) if cost < limit]
+
+
 def common_mouth(scorer: Scorer, scored: Scored) -> list[float]:
     """Twice the log Bayes factor, view by view, that it shows the same mouth as the others.
 
@@ -216,7 +241,8 @@ def row_trial(
     for jaw in (0, 1):
         absent = frozenset(position_of(t) for t in labelling.absent if is_upper(t) == (jaw == 0))
         total += options.defect_cost * row_defects(labels[jaw], absent)
-    return total
+    one = replace(labelling, views=(view,), roles=(role,), labels=(labels,))
+    return total + scorer.looks(one)
 
 
 def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[Scored]]:
@@ -238,18 +264,22 @@ def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[
             # The arch as the other views have it: this view's errors must not be built in.
             points = without_view(scorer, scored, number).adjusted.points
             now = row_trial(scorer, scored, points, number, labels)
-            for jaw in (0, 1):
-                for edit in row_edits(labels[jaw]):
-                    if not _allowed(labelling.views[number], jaw, edit, fixed):
-                        continue
-                    changed = with_row(labelling, number, jaw, edit)
-                    score = row_trial(scorer, scored, points, number, changed.labels[number])
-                    trials.append((score - now, changed))
+            edits = [
+                with_row(labelling, number, jaw, edit)
+                for jaw in (0, 1)
+                for edit in row_edits(labels[jaw])
+                if _allowed(labelling.views[number], jaw, edit, fixed)
+            ]
+            for changed in plausible(scorer, labelling, edits, ROW_TRIALS):
+                score = row_trial(scorer, scored, points, number, changed.labels[number])
+                trials.append((score - now, changed))
         trials.sort(key=lambda trial: (trial[0], trial[1].labels))
         jobs = [changed for _, changed in trials[:JOINT_TRIALS]]
         jobs += [
             edit
-            for edit in missing_tooth_edits(labelling, scored.adjusted)
+            for edit in plausible(
+                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted)
+            )
             if all(
                 _allowed(view, jaw, edit.labels[number][jaw], fixed)
                 for number, view in enumerate(edit.views)
@@ -308,7 +338,7 @@ def solve_shifted(scorer: Scorer, best: Scored, fixed: Fixed) -> list[Scored]:
     """
     shifted = [
         labelling
-        for labelling in shifted_labellings(best.labelling)
+        for labelling in plausible(scorer, best.labelling, shifted_labellings(best.labelling))
         if all(
             _allowed(view, jaw, labelling.labels[number][jaw], fixed)
             for number, view in enumerate(labelling.views)
@@ -364,9 +394,12 @@ def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubt
         for jaw in (0, 1):
             row_doubts.append(
                 tuple(
-                    float(
-                        sum(w for labels, w in weights.items() if labels[view][jaw][k] != label)
-                        / total
+                    max(
+                        LEAST_DOUBT,
+                        float(
+                            sum(w for labels, w in weights.items() if labels[view][jaw][k] != label)
+                            / total
+                        ),
                     )
                     for k, label in enumerate(rows[jaw])
                 )

@@ -119,10 +119,8 @@ class Scorer:
         options: ArchOptions,
         threads: int,
         held: HeldCameras | None = None,
-        primary: frozenset[int] = frozenset(),
     ) -> None:
         self.rows = rows
-        self.primary = primary
         self.held = held
         self.cache = SightingCache(rows)
         self.focals, self.focal_deviations = focals, focal_deviations
@@ -156,10 +154,18 @@ class Scorer:
             focal_deviations=np.ascontiguousarray(self.focal_deviations[list(views)]),
         )
 
+    def looks(self, labelling: Labelling) -> float:
+        """What the looks of the crowns speak against a labelling (evidence)."""
+        return self.options.looks_weight * sum(
+            looks_cost(self.rows[view][jaw], labels[jaw])
+            for view, labels in zip(labelling.views, labelling.labels, strict=True)
+            for jaw in (0, 1)
+        )
+
     def costs(self, labelling: Labelling) -> float:
         """What a labelling costs before it is solved."""
         options = self.options
-        total = options.missing_cost * len(labelling.absent)
+        total = options.missing_cost * len(labelling.absent) + self.looks(labelling)
         absent = (
             frozenset(position_of(t) for t in labelling.absent if is_upper(t)),
             frozenset(position_of(t) for t in labelling.absent if not is_upper(t)),
@@ -167,9 +173,6 @@ class Scorer:
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
             total += options.unused_cost * self.cache.unused(view, labels)
             total += options.defect_cost * sum(row_defects(labels[j], absent[j]) for j in (0, 1))
-            total += options.looks_weight * sum(
-                looks_cost(self.rows[view][j], labels[j]) for j in (0, 1)
-            )
         if len(self.rows) == 3 and options.order is None:
             total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
         return total
@@ -273,10 +276,7 @@ def view_candidates(
     ]
     kept: list[Scored] = []
     for role in roles:
-        jobs = [
-            (Labelling((view,), (role,), (labels,), primary=scorer.primary), None)
-            for labels in pairs
-        ]
+        jobs = [(Labelling((view,), (role,), (labels,)), None) for labels in pairs]
         solved = sorted(scorer.solve_all(list(jobs), VIEW_STEPS), key=_order)
         kept += solved[: scorer.options.candidates_per_view]
     kept.sort(key=_order)

@@ -1,44 +1,99 @@
-"""Which primary teeth a patient still has, by the looks of the crowns in all photographs."""
+"""Which primary teeth a patient still has.
+
+Teeth change in an order: in each jaw the central incisors first, the second primary molars last
+(about six to twelve years of age), so that the primary ones left are those behind some place. Every
+such pair of places, upper and lower, is weighed: by the looks of the crowns in all photographs, and
+by how well the arch of such a child explains where the crowns lie.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
+import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, is_primary, teeth_of
+from pipeline.artifacts.fdi import JAWS, is_primary, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
-from stages.geometry.tooth_rows import POSITIONS, row_probabilities
-from stages.init.dental.numbering.sightings import LOOKS, SeenRow, believed
+from stages.geometry.tooth_rows import NO_TOOTH
+from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
+from stages.init.dental.numbering.sightings import believed
+from stages.init.dental.template import tooth_at
 
-#: Looks of one crown never count for more than this (log odds): photographs err together.
-MOST_ODDS = 3.0
-#: Neighbours change their teeth at about the same age: their odds count by this much.
-NEIGHBOURS = 0.25
+Array = npt.NDArray[np.float64]
+
+#: Places from the midline at which the primary teeth begin: all, none of the incisors, ..., none.
+BEGINNINGS = (1, 2, 3, 4, 5, 6)
+#: Jaws change together: cost of each place between the upper and the lower beginning.
+APART_COST = 4.0
+#: Cost of a jaw amid the change: it lasts some years of a patient's, and looks like errors of both.
+CHANGING_COST = 5.0
+#: Log odds by the looks of a crown at which primary and permanent are as likely: the reader has
+#: seen far fewer primary teeth than there are among children.
+EVEN_ODDS = -2.2
+#: The looks of the crowns of a patient err together: their mean counts as so many.
+CROWNS_COUNTED = 12.0
+#: The arch's evidence is taken at this share: spaces between teeth are not in the textbook.
+ARCH_SHARE = 0.5
 
 
-def primary_teeth(
-    dentitions: list[Dentition], rows: list[tuple[SeenRow, SeenRow]]
-) -> frozenset[int]:
+def primary_teeth(scorer: Scorer, best: Scored, dentitions: list[Dentition]) -> frozenset[int]:
     """Permanent numbers (11-45) in whose place primary teeth stand.
 
     Args:
-        dentitions: the crowns of each photograph with their probabilities.
-        rows: the same crowns as `sightings.seen_rows` has them.
+        scorer, best: the labelling chosen.
+        dentitions: the crowns of its photographs with their probabilities.
     """
-    found: set[int] = set()
-    odds = {jaw: np.zeros(POSITIONS) for jaw in JAWS}
-    for dentition, pair in zip(dentitions, rows, strict=True):
-        for jaw, row in zip(JAWS, pair, strict=True):
-            shares, _ = row_probabilities(row.looks, LOOKS)
-            for crown, share in zip(dentition.crowns(jaw), shares, strict=True):
+    odds = place_odds(best.labelling, dentitions)
+    said = said_numbers(dentitions)
+    start = (best.adjusted.unknowns, best.adjusted.offsets)
+    found: list[tuple[float, frozenset[int]]] = []
+    for upper, lower in product(BEGINNINGS, BEGINNINGS):
+        teeth = frozenset(
+            tooth
+            for jaw, beginning in zip(JAWS, (upper, lower), strict=True)
+            for tooth in teeth_of(jaw)
+            if beginning <= tooth % 10 <= 5
+        )
+        teeth = frozenset(t for t in teeth if said.get(t, True)) | {t for t in said if said[t]}
+        solved = scorer.solve(replace(best.labelling, primary=teeth), start, SEARCH_STEPS)
+        cost = ARCH_SHARE * solved.adjusted.evidence + APART_COST * abs(upper - lower)
+        cost += CHANGING_COST * sum(1 < beginning < 6 for beginning in (upper, lower))
+        seen = {tooth: value for tooth, value in odds.items() if tooth % 10 <= 5}
+        if seen:
+            mean = sum(v if t in teeth else -v for t, v in seen.items()) / len(seen)
+            cost -= CROWNS_COUNTED * mean
+        found.append((cost, teeth))
+    return min(found, key=lambda item: (item[0], sorted(item[1])))[1]
+
+
+def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, float]:
+    """Permanent number -> mean log odds, by looks, that a primary tooth stands there."""
+    values: dict[int, list[float]] = {}
+    for dentition, rows in zip(dentitions, labelling.labels, strict=True):
+        for jaw, labels in zip(JAWS, rows, strict=True):
+            for crown, label in zip(dentition.crowns(jaw), labels, strict=True):
+                if label == NO_TOOTH:
+                    continue
+                tooth = tooth_at(jaw, label)
                 numbers = believed(crown)
-                milk = sum(p for tooth, p in numbers.items() if is_primary(tooth))
-                rest = sum(p for tooth, p in numbers.items() if not is_primary(tooth))
-                sure = np.log(max(milk, 0.02) / max(rest, 0.02))
-                odds[jaw] += np.clip(sure, -MOST_ODDS, MOST_ODDS) * share[:POSITIONS]
-    for jaw in JAWS:
-        own = odds[jaw]
-        beside = np.concatenate([[0], own[:-1]]) + np.concatenate([own[1:], [0]])
-        for tooth, sum_of_odds in zip(teeth_of(jaw), own + NEIGHBOURS * beside, strict=True):
-            if tooth % 10 <= 5 and sum_of_odds > 0:
-                found.add(tooth)
-    return frozenset(found)
+                milk = sum(p for number, p in numbers.items() if is_primary(number))
+                rest = sum(
+                    p
+                    for number, p in numbers.items()
+                    if not is_primary(number) and number % 10 <= 5
+                )
+                odds = np.log(max(milk, 1e-3) / max(rest, 1e-3)) - EVEN_ODDS
+                values.setdefault(tooth, []).append(float(np.clip(odds, -3, 3)))
+    return {tooth: float(np.mean(odds)) for tooth, odds in values.items()}
+
+
+def said_numbers(dentitions: list[Dentition]) -> dict[int, bool]:
+    """Permanent number -> whether a person has said that a primary tooth stands there."""
+    return {
+        permanent_of(crown.number): is_primary(crown.number)
+        for dentition in dentitions
+        for crown in dentition.all_crowns
+        if crown.doubt == 0 and crown.number and crown.number % 10 <= 5
+    }

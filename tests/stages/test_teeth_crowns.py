@@ -1,0 +1,235 @@
+"""From outlines to a dentition: order, roll, landmarks, on crowns whose shape is a formula."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.teeth import Crown, Dentition
+from stages.geometry.crowns import (
+    NATURAL_TILT,
+    ZENITH_FLATNESS,
+    Outline,
+    centroid,
+    dentition_of,
+    outline_of,
+)
+
+SIZE = (600, 400)
+MIDDLE = np.array(SIZE) / 2
+UPPER_WIDTHS = (44.0, 40.0, 50.0, 56.0, 56.0, 48.0, 42.0)
+LOWER_WIDTHS = (40.0, 38.0, 36.0, 36.0, 38.0, 40.0)
+HEIGHT, RISE, ROUND = 70.0, 16.0, 6.0
+#: Landmarks lie this near to where the formula has them, pixels.
+NEAR = 2.5
+
+
+def shape(width: float, jaw: Jaw, bump: float = 0.0) -> np.ndarray:
+    """[K, 2] crown about the middle of its biting edge: an arched gum line, rounded corners.
+
+    Args:
+        bump: place of the zenith along the row, share of half the width.
+    """
+    u = np.linspace(-1, 1, 41)
+    reach = np.where(u > bump, 1 - bump, 1 + bump)
+    gum = -HEIGHT + RISE * ((u - bump) / reach) ** 2
+    edge = -ROUND * u**4
+    points = np.concatenate(
+        [np.stack([u, gum], 1), np.stack([u, edge], 1)[::-1]]
+    ) * np.array([width / 2, 1])  # fmt: skip
+    return points if jaw == "upper" else points * [1, -1]
+
+
+def row(widths: tuple[float, ...], jaw: Jaw, gaps: dict[int, float] | None = None) -> list[float]:
+    """Middles along the row, centred; gaps: index -> free space before the crown."""
+    free = gaps or {}
+    starts = np.cumsum([0.0, *widths[:-1]]) + np.cumsum(
+        [free.get(k, 0) for k in range(len(widths))]
+    )
+    middles = starts + np.array(widths) / 2
+    return list(middles - (starts[-1] + widths[-1]) / 2)
+
+
+def turned(points: np.ndarray, degrees: float) -> np.ndarray:
+    """Clockwise (y down) about the picture's middle."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return (points - MIDDLE) @ np.array([[c, s], [-s, c]]) + MIDDLE
+
+
+def mouth(
+    degrees: float = 0.0, jaws: tuple[Jaw, ...] = ("upper", "lower"), bump: float = 0.0,
+    gaps: dict[int, float] | None = None, apart: float = 2.0,
+) -> list[Outline]:  # fmt: skip
+    """Two rows of crowns, the biting edges `apart`, turned clockwise."""
+    outlines = []
+    for jaw in jaws:
+        widths = UPPER_WIDTHS if jaw == "upper" else LOWER_WIDTHS
+        level = -apart / 2 if jaw == "upper" else apart / 2
+        for k, (x, width) in enumerate(zip(row(widths, jaw, gaps), widths, strict=True)):
+            points = shape(width, jaw, bump) + MIDDLE + [x, level]
+            outlines.append(
+                Outline(turned(points, degrees), jaw, 0.9, {11: 1.0}, number=k + 1, doubt=0.3)
+            )
+    return outlines
+
+
+def read(outlines: list[Outline], **more: object) -> Dentition:
+    return dentition_of(outlines, "000", SIZE, "front", **more)  # type: ignore[arg-type]
+
+
+def shuffled(outlines: list[Outline]) -> list[Outline]:
+    return [outlines[k] for k in np.random.default_rng(0).permutation(len(outlines))]
+
+
+def place(dentition: Dentition, point: np.ndarray | None, degrees: float) -> np.ndarray:
+    """A landmark in the frame of the formulas: from the picture's middle, turned back."""
+    assert point is not None
+    return turned(point[None], -degrees)[0] - MIDDLE
+
+
+@pytest.mark.parametrize("degrees", [0.0, 9.0, -17.0, 30.0, -45.0, 45.0])
+def test_order_and_landmarks_at_any_roll(degrees: float) -> None:
+    found = read(shuffled(mouth(degrees)))
+    assert np.degrees(found.roll) == pytest.approx(degrees, abs=0.5)
+    for jaw, widths in (("upper", UPPER_WIDTHS), ("lower", LOWER_WIDTHS)):
+        up = -1 if jaw == "upper" else 1
+        crowns = found.crowns(jaw)
+        assert [crown.number for crown in crowns] == list(range(1, len(widths) + 1))
+        for k, (crown, x) in enumerate(zip(crowns, row(widths, jaw), strict=True)):
+            half = widths[k] / 2
+            expected = {
+                "zenith": (x, up * (HEIGHT + 1)),
+                "tip": (x, up * 1.0),
+                "papilla_left": (x - half, up * (HEIGHT - RISE + 1)),
+                "papilla_right": (x + half, up * (HEIGHT - RISE + 1)),
+                "embrasure_left": (x - half, up * (ROUND + 1)),
+                "embrasure_right": (x + half, up * (ROUND + 1)),
+            }
+            for name, wanted in expected.items():
+                end = {"left": k == 0, "right": k == len(widths) - 1}
+                if end.get(name.rpartition("_")[2]):
+                    assert getattr(crown, name) is None
+                    continue
+                at = place(found, getattr(crown, name), degrees)
+                assert np.linalg.norm(at - wanted) < NEAR, (jaw, k, name)
+            assert crown.width == pytest.approx(widths[k], abs=NEAR)
+            assert crown.height == pytest.approx(HEIGHT, abs=NEAR)
+            assert (crown.cut_left, crown.cut_right) == (k == 0, k == len(widths) - 1)
+            assert not crown.doubtful
+    assert found.band_height == pytest.approx(2 * HEIGHT, abs=3)
+    assert found.jaws_apart == pytest.approx(2 / 140, abs=0.01)
+
+
+def test_upside_down_photographs_are_turned() -> None:
+    found = read(mouth(180.0))
+    assert abs(np.degrees(found.roll)) == pytest.approx(180, abs=0.5)
+    assert [crown.number for crown in found.upper] == list(range(1, 8))
+    for crown in found.upper:
+        assert crown.zenith[1] > crown.tip[1]
+
+
+def test_a_row_that_is_nearly_level_is_not_turned() -> None:
+    """A view from above or below tilts the rows as much."""
+    found = read(mouth(np.degrees(NATURAL_TILT) - 0.7))
+    assert found.roll == 0
+    given = read(mouth(30.0), roll=np.radians(28.0))
+    assert given.roll == np.radians(28.0)
+
+
+def test_a_zenith_off_the_middle_is_found() -> None:
+    """It is the middle of the stretch that is nearly as high as the highest point."""
+    found = read(mouth(bump=0.4))
+    reach = np.sqrt(ZENITH_FLATNESS * found.band_height / RISE)
+    share = 0.4 + ((1 - 0.4) - (1 + 0.4)) * reach / 2
+    assert share > 0.15
+    for crown, x, width in zip(found.upper, row(UPPER_WIDTHS, "upper"), UPPER_WIDTHS, strict=True):
+        offset = place(found, crown.zenith, 0)[0] - x
+        assert offset == pytest.approx(share * width / 2, abs=0.5)
+
+
+@pytest.mark.parametrize("jaw", ["upper", "lower"])
+def test_one_jaw_alone(jaw: Jaw) -> None:
+    found = read(mouth(20.0, jaws=(jaw,)))
+    other = found.lower if jaw == "upper" else found.upper
+    assert other == ()
+    assert np.degrees(found.roll) == pytest.approx(20, abs=0.5)
+    assert found.band_height == pytest.approx(1.8 * HEIGHT, rel=0.05)
+    assert found.jaws_apart == 0
+    up = -1 if jaw == "upper" else 1
+    for crown in found.crowns(jaw):
+        assert up * (place(found, crown.zenith, 20) - place(found, crown.tip, 20))[1] > 0.9 * HEIGHT
+
+
+def test_across_a_gap_there_is_no_papilla() -> None:
+    found = read(mouth(gaps={3: 20.0}))
+    before, after = found.upper[2], found.upper[3]
+    for crown, side in ((before, "right"), (after, "left")):
+        assert getattr(crown, f"papilla_{side}") is None
+        assert getattr(crown, f"embrasure_{side}") is None
+    assert before.papilla_left is not None
+    assert after.papilla_right is not None
+    # A gap inside is no end of the row.
+    assert not before.cut_right
+    assert not after.cut_left
+    narrow = read(mouth(gaps={3: 4.0})).upper
+    assert narrow[2].papilla_right is not None
+    np.testing.assert_array_equal(narrow[2].papilla_right, narrow[3].papilla_left)
+
+
+def test_jaws_apart_are_measured() -> None:
+    assert read(mouth(apart=28.0)).jaws_apart == pytest.approx(28 / 140, abs=0.03)
+    deep = read(mouth(apart=-30.0))
+    assert deep.jaws_apart == 0
+    assert deep.band_height == pytest.approx(2 * HEIGHT - 30, abs=4)
+
+
+def test_crowns_at_the_border_and_weak_ones_are_doubtful() -> None:
+    outlines = mouth()
+    shift = np.array([-(outlines[0].polygon[:, 0].min() + 10), 0])
+    moved = [replace(o, polygon=np.maximum(o.polygon + shift, 0.5)) for o in outlines]
+    moved[3] = replace(moved[3], score=0.3)
+    found = read(moved)
+    assert [crown.doubtful for crown in found.upper] == [True, False, False, True, *[False] * 3]
+
+
+def test_bad_outlines_are_left_out_and_nothing_is_a_dentition() -> None:
+    line = Outline(np.zeros((2, 2)), "upper")
+    assert read([line]).all_crowns == ()
+    empty = dentition_of([], "a", SIZE, "none", set_aside="why", doubts=("b",))
+    assert (empty.set_aside, empty.doubts, empty.band_height) == ("why", ("b",), 0.0)
+    assert len(read([*mouth(), line]).all_crowns) == len(UPPER_WIDTHS) + len(LOWER_WIDTHS)
+    single = read([mouth()[2]]).upper[0]
+    assert single.papilla_left is None
+    assert single.cut_left
+    assert single.cut_right
+
+
+def test_outlines_lead_to_the_same_dentition_again() -> None:
+    first = read(mouth(33.0), set_aside="why", doubts=("odd",))
+    again = dentition_of(
+        [outline_of(crown) for crown in first.all_crowns], "000", SIZE, "front", first.roll, "why",
+        ("odd",),
+    )  # fmt: skip
+    assert as_text(first) == as_text(again)
+    crown = first.upper[0]
+    assert (crown.score, crown.numbers, crown.number, crown.doubt) == (0.9, {11: 1.0}, 1, 0.3)
+
+
+def as_text(dentition: Dentition) -> str:
+    def plain(value: object) -> object:
+        if isinstance(value, Crown):
+            return vars(value)
+        return value.tolist() if isinstance(value, np.ndarray) else str(value)
+
+    return json.dumps(vars(dentition), default=plain)
+
+
+def test_centroid_is_that_of_the_area() -> None:
+    square = np.array([[0, 0], [1, 0], [2, 0], [4, 0], [4, 2], [0, 2.0]])
+    np.testing.assert_allclose(centroid(square), [2, 1])
+    np.testing.assert_allclose(centroid(square[::-1]), [2, 1])
+    np.testing.assert_allclose(centroid(np.array([[0, 0], [1, 1], [2, 2.0]])), [1, 1])
