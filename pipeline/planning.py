@@ -101,16 +101,32 @@ def resolve_chain(
         names = names[names.index(from_stage) :]
     usable = usable_stages()
     readers = tuple(name for name in order if name in usable and usable[name].uses_sources)
-    prepare = tuple(name for name in order if name in usable and usable[name].prepares)
-    implicit = tuple(n for n in order if n in readers + prepare and n not in names)
+    implicit = tuple(name for name in readers if name not in names)
     if images_named:
         names = (*implicit, *names)
+        prepared = tuple(n for n in order if n not in names and _prepares(n, names, usable))
+        after = max((names.index(name) + 1 for name in readers if name in names), default=0)
+        names = (*names[:after], *prepared, *names[after:])
+        implicit += prepared
     elif not stages and not from_stage:
         names = tuple(n for n in names if n not in readers or store.current(n) is None)
     first = next((name for name in names if name not in implicit), names[0])
     position = order.index(first) if first in order else len(order)
     upstream = tuple(name for name in order[:position] if name not in names)
     return Chain(names, upstream, implicit)
+
+
+def _prepares(name: str, names: Sequence[str], usable: Mapping[str, Stage]) -> bool:
+    """Does a quick stage that nobody named say something that stages named can use?"""
+    if name not in usable or not usable[name].prepares:
+        return False
+    wanted = {
+        kind
+        for other in names
+        if other in usable
+        for kind in (*usable[other].requires, *usable[other].optional)
+    }
+    return bool(wanted & set(usable[name].provides))
 
 
 def provider_table(chain: Chain, store: Store) -> dict[str, Input]:

@@ -32,7 +32,7 @@ class ChoiceOptions:
     least_crowns: int = 5
     least_extent: float = 0.3
     least_colour: float = 4.0
-    same_view: float = 0.06
+    same_view: float = 0.02
     apart_gap: float = 0.3
 
 

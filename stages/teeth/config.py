@@ -37,7 +37,7 @@ class TeethConfig(StageConfig):
         description="mean chroma (CIE ab) below which a photograph is an X-ray or not in colour",
     )  # fmt: skip
     same_view: float = Field(
-        0.06, ge=0, le=1,
+        0.02, ge=0, le=1,
         description="two photographs whose crowns lie this near each other after a similarity "
         "transform, over the width of their rows, show the same",
     )  # fmt: skip

@@ -23,7 +23,8 @@ from stages.init.dental.cameras.held import held_cameras, roll_matrix
 from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.confidence import crown_doubts, fit_doubts, landmark_errors
+from stages.init.dental.numbering.colours import colour_distances
+from stages.init.dental.numbering.confidence import Evidence, fit_doubts, landmark_errors
 from stages.init.dental.numbering.edits import (
     MIN_GAIN,
     Fixed,
@@ -41,7 +42,7 @@ from stages.init.dental.numbering.hypotheses import (
     search,
     view_candidates,
 )
-from stages.init.dental.numbering.primary import primary_teeth
+from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
 from stages.init.dental.numbering.sightings import seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
@@ -141,10 +142,17 @@ def fit_arch(
         doubts += contradiction
     elif len(placeable) == 3:
         doubts += _role_doubts(best)
+    cost, primary = primary_teeth(scorer, best, read)
+    if perhaps_primary(read):
+        # A child's arch may tell another numbering than an adult's.
+        child = Scorer(rows, focal, deviation, scorer.options, threads, held, ALL_PRIMARY)
+        rival, rivals = _label(child, fixed, progress)
+        rival_cost, rival_primary = primary_teeth(child, rival, read)
+        if rival_cost < cost:
+            scorer, best, others, primary = child, rival, rivals, rival_primary
     gaps = margins(best, others)
-    shares = label_doubts(best, others)
-    primary = primary_teeth(scorer, best, read)
-    if primary:
+    shares = label_doubts(best, others, rows)
+    if primary != best.labelling.primary:
         start = (best.adjusted.unknowns, best.adjusted.offsets)
         best = scorer.solve(replace(best.labelling, primary=primary), start)
     common = common_mouth(scorer, best)
@@ -152,11 +160,10 @@ def fit_arch(
     best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],
                           [valid[i] for i in placeable], options, progress)  # fmt: skip
     bands = [dentition.band_height for dentition in read]
-    doubts += crown_doubts(shown, read, options)
-    figures = {f"common_mouth_{view}": gain for view, gain in enumerate(common)}
-    more, measured = fit_doubts(shown, bands, scorer, best, gaps, pairs, options)
+    colours = colour_distances([images[i] for i in placeable], read)
+    evidence = Evidence(gaps, common, colours, bands, pairs)
+    more, figures = fit_doubts(shown, scorer, best, evidence, options)
     doubts += more
-    figures |= measured
     return _outcome(
         scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures, shares
     )

@@ -53,21 +53,20 @@ class ArchOptions:
     #: the cameras drift.
     dense_weight: float = 40.0
     #: Below this margin another labelling is nearly as good: doubt.
-    min_margin: float = 15.0
-    #: The same for labellings that differ in a crown or two.
-    min_local_margin: float = 5.0
-    #: The same for labellings that take other teeth for missing.
-    min_missing_margin: float = 6.0
+    min_margin: float = 6.0
+    #: Do all photographs show one mouth? The log Bayes factor by the places of the teeth in these
+    #: units, and the distance of colours below the largest usual one by this weight, must not come
+    #: to less than 0 together.
+    common_mouth_unit: float = 12.0
+    colour_weight: float = 6.0
+    max_colour: float = 2.45
     #: Median landmark error above which the fit is doubted.
     max_error: float = 0.045
     #: Standard deviation of the angle between neighbouring views above which it is doubted.
-    max_angle_deviation: float = 6.0
+    max_angle_deviation: float = 8.0
     #: Share of the crowns, those at the ends of the rows apart, left without a number above which
     #: a photograph is doubted.
-    max_unnamed: float = 0.1
-    #: Crowns per jaw and photograph below which a photograph is doubted.
-    min_crowns: int = 4
-    #: Dense matches between neighbouring photographs below which a pair is doubted, as a share of
-    #: the chart that both see; and the median distance from the epipolar line above which it is.
-    min_dense_share: float = 0.01
-    max_epipolar_error: float = 0.015
+    max_unnamed: float = 0.25
+    #: Median distance of dense matches from their epipolar lines above which a pair is doubted, as
+    #: a share of the band.
+    max_epipolar_error: float = 0.03

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.teeth import Dentition
 from stages.geometry.tooth_rows import NO_TOOTH
-from stages.init.dental.cameras.bundle import Adjusted, Sightings, view_angles
+from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
@@ -19,14 +19,6 @@ Array = npt.NDArray[np.float64]
 
 #: Prior standard deviations off, beyond which a pose is said to be at the edge.
 EDGE = 2.6
-#: Photographs further apart than this (degrees) need not agree on the unrolled arch.
-DENSE_YAW = 50.0
-#: ... nor need those do so whose landmarks alone tell the angle between them: its deviation and
-#: the landmarks' errors below these shares of what is allowed.
-SECURE_ANGLE = 0.5
-SECURE_ERROR = 0.75
-#: Upper and lower rows of one photograph differ by no more crowns than this.
-MAX_COUNT_DIFFERENCE = 3
 #: Names of what the unknowns of a view are.
 UNKNOWN_NAMES = ("tilt", "yaw", "roll")
 
@@ -60,68 +52,101 @@ def relative_angle_deviation(adjusted: Adjusted, i: int, j: int, angles: Array) 
     return float(np.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0)))
 
 
-def crown_doubts(
-    photos: Sequence[str], dentitions: Sequence[Dentition], options: ArchOptions
-) -> list[str]:
-    """Doubts about what was read from the photographs."""
-    doubts = []
-    for photo, dentition in zip(photos, dentitions, strict=True):
-        upper, lower = len(dentition.upper), len(dentition.lower)
-        if min(upper, lower) < options.min_crowns:
-            doubts.append(
-                f"{photo} shows only {upper} upper and {lower} lower crowns: too few to be "
-                f"sure which teeth they are"
-            )
-        elif abs(upper - lower) > MAX_COUNT_DIFFERENCE:
-            doubts.append(
-                f"{photo} shows {upper} upper but {lower} lower crowns: probably lips, "
-                f"gloves or gums were taken for teeth"
-            )
-    return doubts
+@dataclass(frozen=True)
+class Evidence:
+    """What a fit can be doubted for.
+
+    Attributes:
+        margins: by how much its labelling beats the next, as `edits.margins` has it.
+        common_mouth: per photograph, twice the log Bayes factor that it shows the same mouth as the
+            others (`edits.common_mouth`).
+        colours: per photograph, how far its colours are from the others' (`colours`).
+        bands: per photograph, the height of its band of teeth, pixels.
+        pairs: how the dense matches of pairs agree.
+    """
+
+    margins: tuple[float, float, float]
+    common_mouth: Sequence[float]
+    colours: Sequence[float]
+    bands: Sequence[float]
+    pairs: dict[tuple[int, int], PairFigures]
+
+
+def same_mouth(common: float, colour: float, options: ArchOptions) -> float:
+    """How sure it is that a photograph shows the same mouth as the others; below 0: doubt.
+
+    Args:
+        common: twice the log Bayes factor by the places of the teeth.
+        colour: distance of its colours from the others'.
+    """
+    return common / options.common_mouth_unit + options.colour_weight * (
+        options.max_colour - colour
+    )
 
 
 def fit_doubts(
-    photos: Sequence[str],
-    bands: Sequence[float],
-    scorer: Scorer,
-    best: Scored,
-    margins: tuple[float, float, float],
-    pairs: dict[tuple[int, int], PairFigures],
-    options: ArchOptions,
+    photos: Sequence[str], scorer: Scorer, best: Scored, evidence: Evidence, options: ArchOptions
 ) -> tuple[list[str], dict[str, float]]:
     """Doubts about the fit, and the figures that they rest on.
 
     Args:
         photos: names of the photographs placed, as the user knows them.
-        bands: heights of their bands of teeth, pixels.
         scorer, best: the search and its outcome.
-        margins: by how much it beats the next, as `edits.margins` has it.
-        pairs: how the dense matches of pairs agree (indices into `photos`).
+        evidence: what speaks for and against it.
         options: thresholds.
     """
     adjusted, labelling = best.adjusted, best.labelling
-    doubts: list[str] = []
     figures: dict[str, float] = {
-        "margin": margins[0],
-        "missing_margin": margins[1],
-        "local_margin": margins[2],
+        "margin": min(evidence.margins[:2]),
+        "local_margin": evidence.margins[2],
     }
-    if margins[0] < options.min_margin:
+    doubts: list[str] = []
+    if figures["margin"] < options.min_margin:
         doubts.append(
             f"another numbering of the teeth explains the photographs nearly as well (margin "
-            f"{margins[0]:.0f}, wanted {options.min_margin:.0f}): check the numbers in the overlay "
-            f"and give one of them"
+            f"{figures['margin']:.0f}, wanted {options.min_margin:.0f}): check the numbers"
         )
-    elif margins[1] < options.min_missing_margin:
+    known = scorer.held is not None
+    worst: list[tuple[float, str]] = []
+    for view, photo in enumerate(photos):
+        common, colour = evidence.common_mouth[view], evidence.colours[view]
+        figures[f"common_mouth_{view}"], figures[f"colour_{view}"] = common, colour
+        worst.append((same_mouth(common, colour, options), photo))
+    figures["same_mouth"] = min(sure for sure, _ in worst)
+    # One photograph of another patient makes all three strangers to each other: the worst is named.
+    if figures["same_mouth"] < 0 and not known:
         doubts.append(
-            f"it is not clear whether a tooth is missing (margin {margins[1]:.0f}, wanted "
-            f"{options.min_missing_margin:.0f}): check the numbers in the overlay"
+            f"{min(worst)[1]} may show another patient, or a mirrored picture: its colours and the "
+            "places of its teeth fit the others' badly"
         )
-    elif margins[2] < options.min_local_margin:
-        doubts.append(
-            f"the number of a crown or two is not clear (margin {margins[2]:.0f}, wanted "
-            f"{options.min_local_margin:.0f}): check the numbers in the overlay"
-        )
+    doubts += _view_doubts(photos, scorer, best, evidence.bands, figures, options)
+    priors = scorer.priors(labelling.views, labelling.roles)
+    for (i, j), pair in sorted(evidence.pairs.items()):
+        a, b = photos[i], photos[j]
+        deviation = relative_angle_deviation(adjusted, i, j, priors.angle_deviations)
+        figures[f"angle_deviation_{i}_{j}"] = deviation
+        figures[f"dense_share_{i}_{j}"] = pair.share
+        figures[f"epipolar_error_{i}_{j}"] = pair.epipolar_error
+        if deviation > options.max_angle_deviation:
+            doubts.append(
+                f"the angle between {a} and {b} is uncertain by {deviation:.0f} degrees: "
+                f"too few teeth seen in both"
+            )
+        if pair.epipolar_error > options.max_epipolar_error:
+            doubts.append(
+                f"what matches between {a} and {b} contradicts their cameras (off by "
+                f"{100 * pair.epipolar_error:.1f} % of the height of the row, median)"
+            )
+    return doubts, figures
+
+
+def _view_doubts(
+    photos: Sequence[str], scorer: Scorer, best: Scored, bands: Sequence[float],
+    figures: dict[str, float], options: ArchOptions,
+) -> list[str]:  # fmt: skip
+    """Doubts about single photographs; their figures are added."""
+    adjusted, labelling = best.adjusted, best.labelling
+    doubts = []
     sightings = scorer.cache.collect(list(labelling.views), list(labelling.labels))
     errors = landmark_errors(adjusted, sightings)
     priors = scorer.priors(labelling.views, labelling.roles)
@@ -154,8 +179,7 @@ def fit_doubts(
                 f"{photo} would have been taken from {depth:.0f} mm, which is unusual: "
                 f"cropped, or crowns found badly"
             )
-    for view, (photo, labels) in enumerate(zip(photos, labelling.labels, strict=True)):
-        inner = [label for row in labels for label in row[1:-1]]
+        inner = [label for row in labelling.labels[view] for label in row[1:-1]]
         unnamed = inner.count(NO_TOOTH) / max(len(inner), 1)
         figures[f"unnamed_{view}"] = unnamed
         if unnamed > options.max_unnamed:
@@ -163,30 +187,4 @@ def fit_doubts(
                 f"{inner.count(NO_TOOTH)} crowns of {photo} fit no tooth: crowns found "
                 f"badly, a mirrored photograph or another patient"
             )
-    yaws = view_angles(adjusted)[:, 0]
-    for (i, j), pair in sorted(pairs.items()):
-        a, b = photos[i], photos[j]
-        deviation = relative_angle_deviation(adjusted, i, j, priors.angle_deviations)
-        figures[f"angle_deviation_{i}_{j}"] = deviation
-        figures[f"dense_share_{i}_{j}"] = pair.share
-        figures[f"epipolar_error_{i}_{j}"] = pair.epipolar_error
-        if deviation > options.max_angle_deviation:
-            doubts.append(
-                f"the angle between {a} and {b} is uncertain by {deviation:.0f} degrees: "
-                f"too few teeth seen in both"
-            )
-        apart = float(abs(yaws[j] - yaws[i]))
-        worst = max(figures[f"landmark_error_{i}"], figures[f"landmark_error_{j}"])
-        secure = deviation < SECURE_ANGLE * options.max_angle_deviation
-        secure &= worst < SECURE_ERROR * options.max_error
-        if pair.share < options.min_dense_share and apart < DENSE_YAW and not secure:
-            doubts.append(
-                f"unrolled onto the arch, {a} and {b} hardly agree ({pair.matches} matches "
-                f"on {100 * pair.share:.1f} % of what both show)"
-            )
-        elif pair.epipolar_error > options.max_epipolar_error:
-            doubts.append(
-                f"what matches between {a} and {b} contradicts their cameras (off by "
-                f"{100 * pair.epipolar_error:.1f} % of the height of the row, median)"
-            )
-    return doubts, figures
+    return doubts

@@ -23,6 +23,7 @@ from stages.init.dental.numbering.hypotheses import (
     contiguous,
     row_defects,
 )
+from stages.init.dental.numbering.sightings import SeenRow
 from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
 Array = npt.NDArray[np.float64]
@@ -46,6 +47,9 @@ MAX_EDITS = 6
 NEAREST = 5
 #: Labellings that look less likely than the present one by more than this (evidence) are not tried.
 LOOKS_WINDOW = 60.0
+#: Up to so many teeth may be hidden before the last crown of a row, at this cost each (negative log
+#: probability): about one row in five of the closed bites looked at ends like that.
+HIDDEN_TEETH, HIDDEN_COST = 2, 1.5
 #: No number is surer than this: a doubt of 0 means that a person has said it.
 LEAST_DOUBT = 1e-4
 #: Labellings count as different ones when they name more crowns differently than this.
@@ -370,7 +374,27 @@ def margins(best: Scored, others: list[Scored]) -> tuple[float, float, float]:
     return min(gaps[0]), min(gaps[1]), min(gaps[2])
 
 
-def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubts]]:
+def end_doubt(row: SeenRow, labels: Labels, at_left: bool) -> float:
+    """Probability by looks that the last crown of a row is one further along, those between hidden.
+
+    Nothing but its looks tells of a row's last crown: its other side may be hidden.
+    """
+    end, beside = (0, 1) if at_left else (-1, -2)
+    if len(labels) < 2 or NO_TOOTH in (labels[end], labels[beside]):
+        return 0.0
+    outward = -1 if at_left else 1
+    shares = {}
+    for hidden in range(HIDDEN_TEETH + 1):
+        position = labels[beside] + outward * (1 + hidden)
+        if 0 <= position < POSITIONS:
+            shares[position] = np.exp(row.looks[end, position] - HIDDEN_COST * hidden)
+    total = sum(shares.values())
+    return float(1 - shares.get(labels[end], 0.0) / total) if total > 0 else 0.0
+
+
+def label_doubts(
+    best: Scored, others: list[Scored], rows: list[tuple[SeenRow, SeenRow]]
+) -> list[tuple[Doubts, Doubts]]:
     """Probability, view by view and row by row, that each crown's label is another one.
 
     Every labelling that was solved counts by its evidence; of equal ones the best counts.
@@ -378,6 +402,7 @@ def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubt
     Args:
         best: the labelling chosen.
         others: all others that were solved.
+        rows: of all photographs.
     """
     scores: dict[tuple[ViewLabels, ...], float] = {}
     for scored in (best, *others):
@@ -389,20 +414,21 @@ def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubt
     weights = {labels: np.exp(-(score - least) / 2) for labels, score in scores.items()}
     total = sum(weights.values())
     result = []
-    for view, rows in enumerate(best.labelling.labels):
-        row_doubts = []
-        for jaw in (0, 1):
-            row_doubts.append(
-                tuple(
-                    max(
-                        LEAST_DOUBT,
-                        float(
-                            sum(w for labels, w in weights.items() if labels[view][jaw][k] != label)
-                            / total
-                        ),
-                    )
-                    for k, label in enumerate(rows[jaw])
-                )
+    for number, (view, chosen) in enumerate(
+        zip(best.labelling.views, best.labelling.labels, strict=True)
+    ):
+        both = []
+        for jaw, own in enumerate(chosen):
+            found = np.array(
+                [
+                    sum(w for other, w in weights.items() if other[number][jaw][k] != label) / total
+                    for k, label in enumerate(own)
+                ]
             )
-        result.append((row_doubts[0], row_doubts[1]))
+            if len(own) > 1:
+                row = rows[view][jaw]
+                found[0] = max(found[0], end_doubt(row, own, at_left=True))
+                found[-1] = max(found[-1], end_doubt(row, own, at_left=False))
+            both.append(tuple(float(doubt) for doubt in np.clip(found, LEAST_DOUBT, 1.0)))
+        result.append((both[0], both[1]))
     return result

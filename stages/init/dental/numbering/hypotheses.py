@@ -119,8 +119,10 @@ class Scorer:
         options: ArchOptions,
         threads: int,
         held: HeldCameras | None = None,
+        primary: frozenset[int] = frozenset(),
     ) -> None:
         self.rows = rows
+        self.primary = primary
         self.held = held
         self.cache = SightingCache(rows)
         self.focals, self.focal_deviations = focals, focal_deviations
@@ -276,7 +278,10 @@ def view_candidates(
     ]
     kept: list[Scored] = []
     for role in roles:
-        jobs = [(Labelling((view,), (role,), (labels,)), None) for labels in pairs]
+        jobs = [
+            (Labelling((view,), (role,), (labels,), primary=scorer.primary), None)
+            for labels in pairs
+        ]
         solved = sorted(scorer.solve_all(list(jobs), VIEW_STEPS), key=_order)
         kept += solved[: scorer.options.candidates_per_view]
     kept.sort(key=_order)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.fdi import JAWS, is_primary, permanent_of, teeth_of
-from pipeline.artifacts.teeth import Dentition
+from pipeline.artifacts.teeth import Crown, Dentition
 from stages.geometry.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
 from stages.init.dental.numbering.sightings import believed
@@ -25,6 +25,8 @@ Array = npt.NDArray[np.float64]
 
 #: Places from the midline at which the primary teeth begin: all, none of the incisors, ..., none.
 BEGINNINGS = (1, 2, 3, 4, 5, 6)
+#: The permanent numbers in whose place a primary tooth can stand.
+ALL_PRIMARY = frozenset(tooth for jaw in JAWS for tooth in teeth_of(jaw) if tooth % 10 <= 5)
 #: Jaws change together: cost of each place between the upper and the lower beginning.
 APART_COST = 4.0
 #: Cost of a jaw amid the change: it lasts some years of a patient's, and looks like errors of both.
@@ -32,18 +34,34 @@ CHANGING_COST = 5.0
 #: Log odds by the looks of a crown at which primary and permanent are as likely: the reader has
 #: seen far fewer primary teeth than there are among children.
 EVEN_ODDS = -2.2
+#: Mean log odds this much below even still ask for a look at a child's arch.
+CHILD_WINDOW = 0.7
+#: Crowns with less probability than this of standing before the molars say nothing.
+LEAST_SHARE = 0.05
 #: The looks of the crowns of a patient err together: their mean counts as so many.
 CROWNS_COUNTED = 12.0
 #: The arch's evidence is taken at this share: spaces between teeth are not in the textbook.
 ARCH_SHARE = 0.5
 
 
-def primary_teeth(scorer: Scorer, best: Scored, dentitions: list[Dentition]) -> frozenset[int]:
-    """Permanent numbers (11-45) in whose place primary teeth stand.
+def perhaps_primary(dentitions: list[Dentition]) -> bool:
+    """Do the crowns look so that this may be a child's mouth?"""
+    odds = [_odds(crown) for dentition in dentitions for crown in dentition.all_crowns]
+    known = [value for value in odds if value is not None]
+    return bool(known) and float(np.mean(known)) > -CHILD_WINDOW
+
+
+def primary_teeth(
+    scorer: Scorer, best: Scored, dentitions: list[Dentition]
+) -> tuple[float, frozenset[int]]:
+    """Permanent numbers (11-45) in whose place primary teeth stand, and what that costs.
 
     Args:
-        scorer, best: the labelling chosen.
+        scorer, best: a labelling.
         dentitions: the crowns of its photographs with their probabilities.
+
+    Returns:
+        The cost (evidence, to compare labellings with) and the teeth.
     """
     odds = place_odds(best.labelling, dentitions)
     said = said_numbers(dentitions)
@@ -58,14 +76,14 @@ def primary_teeth(scorer: Scorer, best: Scored, dentitions: list[Dentition]) -> 
         )
         teeth = frozenset(t for t in teeth if said.get(t, True)) | {t for t in said if said[t]}
         solved = scorer.solve(replace(best.labelling, primary=teeth), start, SEARCH_STEPS)
-        cost = ARCH_SHARE * solved.adjusted.evidence + APART_COST * abs(upper - lower)
+        cost = ARCH_SHARE * solved.score + APART_COST * abs(upper - lower)
         cost += CHANGING_COST * sum(1 < beginning < 6 for beginning in (upper, lower))
         seen = {tooth: value for tooth, value in odds.items() if tooth % 10 <= 5}
         if seen:
             mean = sum(v if t in teeth else -v for t, v in seen.items()) / len(seen)
             cost -= CROWNS_COUNTED * mean
         found.append((cost, teeth))
-    return min(found, key=lambda item: (item[0], sorted(item[1])))[1]
+    return min(found, key=lambda item: (item[0], sorted(item[1])))
 
 
 def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, float]:
@@ -76,17 +94,20 @@ def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, f
             for crown, label in zip(dentition.crowns(jaw), labels, strict=True):
                 if label == NO_TOOTH:
                     continue
-                tooth = tooth_at(jaw, label)
-                numbers = believed(crown)
-                milk = sum(p for number, p in numbers.items() if is_primary(number))
-                rest = sum(
-                    p
-                    for number, p in numbers.items()
-                    if not is_primary(number) and number % 10 <= 5
-                )
-                odds = np.log(max(milk, 1e-3) / max(rest, 1e-3)) - EVEN_ODDS
-                values.setdefault(tooth, []).append(float(np.clip(odds, -3, 3)))
+                odds = _odds(crown)
+                if odds is not None:
+                    values.setdefault(tooth_at(jaw, label), []).append(odds)
     return {tooth: float(np.mean(odds)) for tooth, odds in values.items()}
+
+
+def _odds(crown: Crown) -> float | None:
+    """Log odds by its looks that a crown is primary; None where nothing is known of them."""
+    numbers = believed(crown)
+    milk = sum(p for number, p in numbers.items() if is_primary(number))
+    rest = sum(p for number, p in numbers.items() if not is_primary(number) and number % 10 <= 5)
+    if milk + rest < LEAST_SHARE:
+        return None
+    return float(np.clip(np.log(max(milk, 1e-3) / max(rest, 1e-3)) - EVEN_ODDS, -3, 3))
 
 
 def said_numbers(dentitions: list[Dentition]) -> dict[int, bool]:
