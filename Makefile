@@ -2,8 +2,7 @@
 # Ubuntu have packages for.
 
 PYTHON ?= python3
-MOUTHS ?= 900
-STEPS ?= 6000
+MOUTHS ?= 360
 BIN := .venv/bin
 
 .PHONY: demo test lint bench reader system chromium clean
@@ -27,7 +26,10 @@ reader: .venv/installed-dev
 	@test -d "$(DATA)" || { echo "make reader DATA=FOLDER: a folder with train/, valid/, fdi.json"; exit 2; }
 	$(BIN)/python data_samples/mouths/__main__.py --count $(MOUTHS) --seed 1 --out runs/mouths
 	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
-	    --mouths runs/mouths --steps $(STEPS) --out runs/reader.pt
+	    --mouths runs/mouths --steps 4600 --out runs/reader_start.pt
+	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
+	    --mouths runs/mouths --steps 2600 --rate 0.0015 --seed 1 --start runs/reader_start.pt \
+	    --out runs/reader.pt
 	$(BIN)/python tools/reader/export.py runs/reader.pt stages/teeth/reader.onnx
 	$(BIN)/python tools/reader/score.py --data "$(DATA)"
 

@@ -28,7 +28,7 @@ from pipeline.report.pictures import picture
 Content = dict[str, Any]
 
 #: Numbers are marked from this doubt on.
-DOUBTFUL = 0.2
+DOUBTFUL = 0.1
 #: Long side in pixels of a photograph on the page, and of one without teeth.
 LARGE, SMALL = 1280, 480
 #: Numbers offered for a crown.

@@ -28,7 +28,7 @@ DOUBTFUL: Colour = (200, 0, 0)
 WHITE: Colour = (255, 255, 255)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 #: Numbers with more doubt than this are marked.
-DOUBT_SHOWN = 0.2
+DOUBT_SHOWN = 0.1
 #: Fixed-point bits of OpenCV's drawing coordinates.
 SHIFT = 4
 

@@ -199,6 +199,7 @@ def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
         "upper_teeth": len({tooth for view in placed for tooth in view.upper if tooth}),
         "lower_teeth": len({tooth for view in placed for tooth in view.lower if tooth}),
         "label_margin": round(teeth.fit.margin, 1),
+        "teeth_confidence": round(teeth.fit.confidence, 3),
         "landmark_error_px": round(float(np.median([view.error for view in placed])), 2),
     }
 

@@ -34,7 +34,7 @@ class TeethStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.teeth import Dentition, Teeth
-        from stages.geometry.teeth_overlay import labelled_overlay
+        from stages.geometry.teeth_overlay import DOUBT_SHOWN, labelled_overlay
         from stages.teeth.choose import ChoiceOptions, choose
         from stages.teeth.reader import read_photographs, shows_teeth
 
@@ -74,5 +74,5 @@ class TeethStage(Stage):
         context.summarize(
             photographs_with_teeth=len(teeth.chosen),
             crowns=len(crowns),
-            doubtful_crowns=sum(crown.doubt > 0.2 for crown in crowns),
+            doubtful_crowns=sum(crown.doubt > DOUBT_SHOWN for crown in crowns),
         )

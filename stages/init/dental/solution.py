@@ -56,6 +56,8 @@ class ArchFit:
         doubts: sentences for the user why the result should not be trusted; empty: trust it.
         scale_uncertainty: relative standard deviation of the millimetres.
         figures: what the doubts rest on.
+        confidence: 0..1, how far the numbers and the cameras can be trusted; doubts say why not
+            where it is below .5.
         primary: permanent numbers in whose place primary teeth stand.
     """
 
@@ -67,6 +69,7 @@ class ArchFit:
     scale_uncertainty: float = 0.15
     figures: dict[str, float] = field(default_factory=dict)
     primary: frozenset[int] = frozenset()
+    confidence: float = 0.0
 
     def number_of(self, tooth: int) -> int:
         """FDI number of the tooth that stands in the place of a permanent one; 0 for 0."""

@@ -24,7 +24,12 @@ from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prep
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import colour_distances
-from stages.init.dental.numbering.confidence import Evidence, fit_doubts, landmark_errors
+from stages.init.dental.numbering.confidence import (
+    Evidence,
+    case_confidence,
+    fit_doubts,
+    landmark_errors,
+)
 from stages.init.dental.numbering.edits import (
     MIN_GAIN,
     Fixed,
@@ -408,6 +413,7 @@ def _outcome(
         scale_uncertainty=SCALE_UNCERTAINTY,
         figures=figures,
         primary=labelling.primary,
+        confidence=case_confidence(figures, bool(doubts), scorer.options),
     )
 
 

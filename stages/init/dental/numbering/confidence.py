@@ -19,6 +19,8 @@ Array = npt.NDArray[np.float64]
 
 #: Prior standard deviations off, beyond which a pose is said to be at the edge.
 EDGE = 2.6
+#: Evidence beyond the least margin, and sureness of one mouth, that raise the odds by a factor e.
+MARGIN_UNIT, SAME_MOUTH_UNIT = 4.0, 1.5
 #: Names of what the unknowns of a view are.
 UNKNOWN_NAMES = ("tilt", "yaw", "roll")
 
@@ -82,6 +84,21 @@ def same_mouth(common: float, colour: float, options: ArchOptions) -> float:
     return common / options.common_mouth_unit + options.colour_weight * (
         options.max_colour - colour
     )
+
+
+def case_confidence(figures: dict[str, float], doubted: bool, options: ArchOptions) -> float:
+    """One confidence for a case, 0..1: by its weakest point; below .5 exactly where it is doubted.
+
+    Args:
+        figures: of `fit_doubts`.
+        doubted: is there any doubt?
+    """
+    weakest = min(
+        (figures["margin"] - options.min_margin) / MARGIN_UNIT,
+        SAME_MOUTH_UNIT * figures["same_mouth"],
+    )
+    confidence = 1 / (1 + float(np.exp(-np.clip(weakest, -30, 30))))
+    return min(confidence, 0.49) if doubted else max(confidence, 0.5)
 
 
 def fit_doubts(

@@ -33,7 +33,7 @@ APART_COST = 4.0
 CHANGING_COST = 5.0
 #: Log odds by the looks of a crown at which primary and permanent are as likely: the reader has
 #: seen far fewer primary teeth than there are among children.
-EVEN_ODDS = -2.2
+EVEN_ODDS = -3.2
 #: Mean log odds this much below even still ask for a look at a child's arch.
 CHILD_WINDOW = 0.7
 #: Crowns with less probability than this of standing before the molars say nothing.
