@@ -167,7 +167,11 @@ def _jaws_apart(outlines: list[Outline], rows: dict[Jaw, list[int]], band: float
 
 @dataclass(frozen=True)
 class _Local:
-    """A crown's outline in directions of its row: [N] along it and [N] towards the gum."""
+    """A crown's outline in the upright frame: [N] along the row and [N] towards the gum.
+
+    Both are the frame's own directions, also where a row climbs: the patient's upright is upright
+    in the picture all along it.
+    """
 
     along: Array
     gum: Array
@@ -182,26 +186,6 @@ def _resampled(polygon: Array, step: float) -> Array:
         for a, b, length in zip(polygon, after, lengths, strict=True)
     ]
     return np.concatenate(parts)
-
-
-def _directions(centres: Array, jaw: Jaw) -> list[tuple[Array, Array]]:
-    """Unit vectors along the row and towards the gum at each crown, from its neighbours."""
-    count = len(centres)
-    result = []
-    for k in range(count):
-        first, last = max(0, k - 1), min(count - 1, k + 1)
-        step = centres[last] - centres[first]
-        # Steep steps come of displaced crowns, not of the row.
-        slope = float(np.clip(step[1] / max(step[0], 1e-6), -0.7, 0.7)) if count > 1 else 0.0
-        along = np.array([1.0, slope]) / math.hypot(1.0, slope)
-        result.append((along, _gumward(along, jaw)))
-    return result
-
-
-def _gumward(along: Array, jaw: Jaw) -> Array:
-    """The direction towards the gum beside a direction along the row (left to right, y down)."""
-    up = np.array([along[1], -along[0]])
-    return up if jaw == "upper" else -up
 
 
 def _extreme(local: _Local, flatness: float, towards_gum: bool) -> tuple[float, float]:
@@ -226,72 +210,61 @@ def _envelope(local: _Local, at: Array, outer: bool) -> Array:
     return np.where(np.isfinite(result), sign * result, np.nan)
 
 
-def _parting(
-    first: Array, second: Array, along: Array, gumward: Array, band: float, at_gum: bool
-) -> Array | None:
-    """Where two neighbours part at the gum (papilla) or the biting edge (embrasure).
+def _parting(first: _Local, second: _Local, band: float, at_gum: bool) -> Array | None:
+    """(along, gumward) where two neighbours part at the gum (papilla) or biting edge (embrasure).
 
     Args:
-        first, second: [N, 2] points on their outlines, left and right.
-        along, gumward: directions there.
+        first, second: their outlines, left and right.
     """
-    locals_ = [_Local(points @ along, points @ gumward) for points in (first, second)]
     flatness = ZENITH_FLATNESS if at_gum else TIP_FLATNESS
-    start, end = (_extreme(local, flatness * band, at_gum)[0] for local in locals_)
+    start, end = (_extreme(local, flatness * band, at_gum)[0] for local in (first, second))
     step = max(SAMPLING * band * 1.5, 0.4)
     if end - start < 4 * step:
         return None
     at = np.arange(start, end, step)
-    with np.errstate(invalid="ignore"):
-        profiles = np.stack([_envelope(local, at, at_gum) for local in locals_])
-        sign = 1.0 if at_gum else -1.0
-        line = np.nanmax(np.where(np.isnan(profiles), -np.inf, sign * profiles), axis=0)
+    sign = 1.0 if at_gum else -1.0
+    profiles = np.stack([_envelope(local, at, at_gum) for local in (first, second)])
+    line = np.max(np.where(np.isnan(profiles), -np.inf, sign * profiles), axis=0)
     known = np.isfinite(line)
     if known.sum() < 4:
         return None
     lowest = float(line[known].min())
     stretch = at[known & (line <= lowest + PARTING_FLATNESS * band)]
-    place = float((stretch.min() + stretch.max()) / 2)
-    return np.asarray(place * along + sign * lowest * gumward)
+    return np.array([(stretch.min() + stretch.max()) / 2, sign * lowest])
 
 
 def _row(outlines: list[Outline], jaw: Jaw, band: float) -> list[Crown]:
     """Crowns with landmarks, in the upright frame, of outlines from left to right."""
     if not outlines:
         return []
+    sign = -1.0 if jaw == "upper" else 1.0  # rows of pixels grow downwards
     points = [_resampled(o.polygon, max(SAMPLING * band, 0.25)) for o in outlines]
-    centres = np.array([centroid(outline.polygon) for outline in outlines])
-    directions = _directions(centres, jaw)
+    locals_ = [_Local(p[:, 0], sign * p[:, 1]) for p in points]
     partings: list[tuple[Array | None, Array | None]] = []
-    for k, (before, after) in enumerate(pairwise(points)):
-        width = min(np.ptp(before[:, 0]), np.ptp(after[:, 0]))
-        apart = float(after[:, 0].min() - before[:, 0].max())
-        if apart > GAP * width:
-            partings.append((None, None))
-            continue
-        along = directions[k][0] + directions[k + 1][0]
-        along /= np.linalg.norm(along)
-        gumward = _gumward(along, jaw)
+    for before, after in pairwise(locals_):
+        width = min(np.ptp(before.along), np.ptp(after.along))
+        apart = float(after.along.min() - before.along.max())
+        joined = apart <= GAP * width
         papilla, embrasure = (
-            _parting(before, after, along, gumward, band, at_gum) for at_gum in (True, False)
+            _parting(before, after, band, at_gum) if joined else None for at_gum in (True, False)
         )
         partings.append((papilla, embrasure))
+
+    def placed(point: Array | tuple[float, float]) -> Array:
+        return np.array([point[0], sign * point[1]])
+
     crowns = []
-    none = (None, None)
-    for k, outline in enumerate(outlines):
-        along, gumward = directions[k]
-        local = _Local(points[k] @ along, points[k] @ gumward)
-        zenith = _extreme(local, ZENITH_FLATNESS * band, True)
-        tip = _extreme(local, TIP_FLATNESS * band, False)
-        left = partings[k - 1] if k > 0 else none
-        right = partings[k] if k < len(partings) else none
+    for k, (outline, local) in enumerate(zip(outlines, locals_, strict=True)):
+        left = partings[k - 1] if k > 0 else (None, None)
+        right = partings[k] if k < len(partings) else (None, None)
+        beside = [None if p is None else placed(p) for p in (*left, *right)]
         crowns.append(
             Crown(
                 jaw=jaw,
-                zenith=zenith[0] * along + zenith[1] * gumward,
-                tip=tip[0] * along + tip[1] * gumward,
-                papilla_left=left[0], papilla_right=right[0],
-                embrasure_left=left[1], embrasure_right=right[1],
+                zenith=placed(_extreme(local, ZENITH_FLATNESS * band, True)),
+                tip=placed(_extreme(local, TIP_FLATNESS * band, False)),
+                papilla_left=beside[0], embrasure_left=beside[1],
+                papilla_right=beside[2], embrasure_right=beside[3],
                 width=float(np.ptp(local.along)),
                 height=max(float(np.ptp(local.gum)), 1.0),
                 cut_left=k == 0, cut_right=k == len(outlines) - 1,

@@ -31,9 +31,14 @@ ALL_PRIMARY = frozenset(tooth for jaw in JAWS for tooth in teeth_of(jaw) if toot
 APART_COST = 4.0
 #: Cost of a jaw amid the change: it lasts some years of a patient's, and looks like errors of both.
 CHANGING_COST = 5.0
+#: Cost of each second molar seen beside primary teeth (they come when the last of those go), and of
+#: each first molar beside primary central incisors (the one comes when the other goes).
+LATE_MOLAR_COST, EARLY_MOLAR_COST = 8.0, 3.0
 #: Log odds by the looks of a crown at which primary and permanent are as likely: the reader has
 #: seen far fewer primary teeth than there are among children.
 EVEN_ODDS = -3.2
+#: Odds of one crown count no more than this.
+MOST_ODDS = 2.0
 #: Mean log odds this much below even still ask for a look at a child's arch.
 CHILD_WINDOW = 0.7
 #: Crowns with less probability than this of standing before the molars say nothing.
@@ -64,6 +69,8 @@ def primary_teeth(
         The cost (evidence, to compare labellings with) and the teeth.
     """
     odds = place_odds(best.labelling, dentitions)
+    places = [_back_place(label) for rows in best.labelling.labels for row in rows for label in row]
+    first_molars, second_molars = places.count(6), places.count(7)
     said = said_numbers(dentitions)
     start = (best.adjusted.unknowns, best.adjusted.offsets)
     found: list[tuple[float, frozenset[int]]] = []
@@ -78,12 +85,21 @@ def primary_teeth(
         solved = scorer.solve(replace(best.labelling, primary=teeth), start, SEARCH_STEPS)
         cost = ARCH_SHARE * solved.score + APART_COST * abs(upper - lower)
         cost += CHANGING_COST * sum(1 < beginning < 6 for beginning in (upper, lower))
+        if teeth:
+            cost += LATE_MOLAR_COST * second_molars
+        if min(upper, lower) == 1:
+            cost += EARLY_MOLAR_COST * first_molars
         seen = {tooth: value for tooth, value in odds.items() if tooth % 10 <= 5}
         if seen:
             mean = sum(v if t in teeth else -v for t, v in seen.items()) / len(seen)
             cost -= CROWNS_COUNTED * mean
         found.append((cost, teeth))
     return min(found, key=lambda item: (item[0], sorted(item[1])))
+
+
+def _back_place(label: int) -> int:
+    """Place from the midline of a position along the row, 0 for `NO_TOOTH`."""
+    return 0 if label == NO_TOOTH else tooth_at("upper", label) % 10
 
 
 def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, float]:
@@ -107,7 +123,9 @@ def _odds(crown: Crown) -> float | None:
     rest = sum(p for number, p in numbers.items() if not is_primary(number) and number % 10 <= 5)
     if milk + rest < LEAST_SHARE:
         return None
-    return float(np.clip(np.log(max(milk, 1e-3) / max(rest, 1e-3)) - EVEN_ODDS, -3, 3))
+    return float(
+        np.clip(np.log(max(milk, 1e-3) / max(rest, 1e-3)) - EVEN_ODDS, -MOST_ODDS, MOST_ODDS)
+    )
 
 
 def said_numbers(dentitions: list[Dentition]) -> dict[int, bool]:
