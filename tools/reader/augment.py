@@ -1,4 +1,4 @@
-"""From a labelled photograph to what the network sees in one step: framed, turned, lit otherwise."""
+"""From a labelled photograph to what the network sees: framed, turned, lit otherwise."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ same network with its normalisation folded in, written by `export.py` and run by
 from __future__ import annotations
 
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 
 WIDTH, HEIGHT = 448, 320
 #: The answer's channels, in order. Positions run from the central incisor (1) to the third molar.

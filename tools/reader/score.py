@@ -2,8 +2,8 @@
 
     python tools/reader/score.py --data teeth_labelled [--split valid] [--sheet sheet.png]
 
-Prints the overlap (IoU) of all teeth, crowns found at IoU .5, and, where numbers are known, jaws and
-numbers by one photograph alone.
+Prints the overlap (IoU) of all teeth, crowns found at IoU .5, and, where numbers are known, jaws
+and numbers by one photograph alone.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ from augment import Example, example
 from network import BORDER, CENTRE, INSIDE, JAW, POSITION, PRIMARY, SIDE, TOOTH, VIEWS, Reader
 from samples import UNNUMBERED, Sample, read_generated, read_labelled
 from torch import Tensor
-from torch.nn import functional as F
-
+from torch.nn import functional as F  # noqa: N812
 
 #: Primary teeth are rarer among the photographs than among children: each counts as so many.
 PRIMARY_WEIGHT = 4.0
@@ -127,13 +126,12 @@ def validate(net: Reader, batch: dict[str, Tensor]) -> str:
 
     position = answer[:, POSITION].argmax(1)
     view = kind[:, : len(VIEWS)].argmax(1) == batch["view"]
-    text = (
+    return (
         f"IoU {iou.median():.3f}/{iou.quantile(0.1):.3f} "
         f"jaw {right(answer[:, JAW] > 0, lower):.3f} side {right(answer[:, SIDE] > 0, left):.3f} "
         f"place {right(position, number % 10 - 1):.3f} "
         f"view {view[batch['view'] >= 0].float().mean():.3f}"
     )
-    return text
 
 
 def main() -> None:
