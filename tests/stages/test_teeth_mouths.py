@@ -112,7 +112,8 @@ def test_places_of_changing_teeth() -> None:
         truth = true_numbers(photo, dentition)
         for jaw in JAWS:
             for crown, true in zip(dentition.crowns(jaw), truth[jaw], strict=True):
-                assert permanent_of(crown.number) in (0, permanent_of(true))
+                if crown.doubt < DOUBTED:
+                    assert permanent_of(crown.number) in (0, permanent_of(true))
 
 
 @pytest.mark.parametrize(
