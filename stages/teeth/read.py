@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +18,7 @@ from stages.geometry.tooth_rows import (
     row_probabilities,
 )
 from stages.teeth.instances import Found, find_crowns
-from stages.teeth.network import HEIGHT, KINDS, WIDTH, Answer, Transform, fitted, look
+from stages.teeth.network import HEIGHT, KINDS, WIDTH, Transform, fitted, look
 from stages.teeth.numbers import looks
 
 Array32 = npt.NDArray[np.float32]
@@ -77,7 +76,7 @@ def read_photograph(
     if not crowns:
         return Reading(Dentition(name, size, "none"), kinds, apart)
     likely = max(kinds, key=lambda k: kinds[k])
-    outlines = _outlines(crowns, answer)
+    outlines = _outlines(crowns)
     dentition = dentition_of(outlines, name, size, likely)
     return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
 
@@ -100,9 +99,8 @@ def _jaw(lower: float) -> Jaw:
     return "lower" if lower > 0 else "upper"
 
 
-def _outlines(crowns: list[Found], answer: Answer) -> list[Outline]:
-    """The crowns with their jaw and looks; a crown that is unsure goes with its neighbours."""
-    del answer
+def _outlines(crowns: list[Found]) -> list[Outline]:
+    """The crowns with their jaw and looks."""
     jaws = [_jaw(crown.lower) for crown in crowns]
     return [
         Outline(
@@ -148,12 +146,6 @@ def _with_number(crown: Crown, jaw: Jaw, share: npt.NDArray[np.float64]) -> Crow
         if crown.numbers.get(milk, 0.0) > crown.numbers.get(tooth, 0.0):
             tooth = milk
     return replace(crown, number=tooth, doubt=float(min(1.0, max(1e-4, 1 - share[best]))))
-
-
-def teeth_area(dentition: Dentition) -> float:
-    """Share of the photograph that is teeth."""
-    area = sum(abs(cv2.contourArea(c.outline.astype(np.float32))) for c in dentition.all_crowns)
-    return float(area / (dentition.size[0] * dentition.size[1]))
 
 
 def row_extent(dentition: Dentition) -> float:
