@@ -33,6 +33,7 @@ class ChoiceOptions:
     least_extent: float = 0.3
     least_colour: float = 4.0
     same_view: float = 0.02
+    least_score: float = 0.85
     apart_gap: float = 0.3
 
 
@@ -68,6 +69,8 @@ def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
         return "it has no colour: an X-ray, or not a photograph"
     if len(dentition.all_crowns) < options.least_crowns:
         return f"no row of teeth was found in it ({len(dentition.all_crowns)} crowns)"
+    if float(np.median([c.score for c in dentition.all_crowns])) < options.least_score:
+        return "what was found in it hardly looks like teeth"
     if row_extent(dentition) < options.least_extent:
         return "the teeth are too small in it: a face, or taken from too far away"
     occlusal = {kind: reading.kinds[kind] for kind in _OCCLUSAL}

@@ -36,6 +36,11 @@ class TeethConfig(StageConfig):
         4.0, ge=0, le=100,
         description="mean chroma (CIE ab) below which a photograph is an X-ray or not in colour",
     )  # fmt: skip
+    least_score: float = Field(
+        0.85, ge=0, le=1,
+        description="with a lower median score of its crowns a photograph shows something else "
+        "(photographs of teeth: .94 and more; of houses: .8 at most)",
+    )  # fmt: skip
     same_view: float = Field(
         0.02, ge=0, le=1,
         description="two photographs whose crowns lie this near each other after a similarity "

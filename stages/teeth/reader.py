@@ -18,7 +18,9 @@ Progress = Callable[[str, int, int], None]
 #: this share must show them.
 _ASKED, _SHARE = 3, 0.3
 #: Share of a photograph that is tooth, and crowns in it, to show teeth.
-_LEAST_TOOTH, _LEAST_CROWNS = 0.015, 4
+_LEAST_TOOTH, _LEAST_CROWNS = 0.015, 6
+#: Score of a crown at the first look that counts for that.
+_SURE = 0.8
 
 
 def shows_teeth(views: Sequence[View]) -> bool:
@@ -32,7 +34,7 @@ def _has_teeth(view: View) -> bool:
     answer = look(view.image, view.valid(), fitted((view.height, view.width)), flip=False)
     if float((answer.tooth > 0).mean()) < _LEAST_TOOTH:
         return False
-    return sum(crown.score > 0.5 for crown in find_crowns(answer)) >= _LEAST_CROWNS
+    return sum(crown.score > _SURE for crown in find_crowns(answer)) >= _LEAST_CROWNS
 
 
 def read_photographs(views: Sequence[View], threads: int, progress: Progress) -> list[Reading]:

@@ -51,8 +51,9 @@ class TeethStage(Stage):
             return
         readings = read_photographs(views, context.threads, context.progress)
         options = ChoiceOptions(
-            config.least_crowns, config.least_extent, config.least_colour, config.same_view
-        )
+            config.least_crowns, config.least_extent, config.least_colour, config.same_view,
+            config.least_score,
+        )  # fmt: skip
         names = [view.source_name or view.name for view in views]
         images = [view.image for view in views]
         dentitions = (
