@@ -2,7 +2,9 @@
 # Ubuntu have packages for.
 
 PYTHON ?= python3
-MOUTHS ?= 360
+MOUTHS ?= 750
+STEPS ?= 9000
+RATE ?= 0.003
 BIN := .venv/bin
 
 .PHONY: demo test lint bench reader system chromium clean
@@ -22,13 +24,12 @@ bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
 # The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: hours.
+# START=FILE goes on from weights that an earlier training wrote (4000 steps at RATE=0.002 then do).
 reader: .venv/installed-dev
 	@test -d "$(DATA)" || { echo "make reader DATA=FOLDER: a folder with train/, valid/, fdi.json"; exit 2; }
-	$(BIN)/python data_samples/mouths/__main__.py --count $(MOUTHS) --seed 1 --out runs/mouths
+	$(BIN)/python data_samples/mouths/__main__.py --count $(MOUTHS) --seed 1 --jobs 2 --out runs/mouths
 	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
-	    --mouths runs/mouths --steps 4600 --out runs/reader_start.pt
-	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
-	    --mouths runs/mouths --steps 2600 --rate 0.0015 --seed 1 --start runs/reader_start.pt \
+	    --mouths runs/mouths --steps $(STEPS) --rate $(RATE) $(if $(START),--start $(START)) \
 	    --out runs/reader.pt
 	$(BIN)/python tools/reader/export.py runs/reader.pt stages/teeth/reader.onnx
 	$(BIN)/python tools/reader/score.py --data "$(DATA)"

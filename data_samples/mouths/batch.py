@@ -1,10 +1,10 @@
 """Write many photographs with their labels into a folder.
 
-    python data_samples/mouths/__main__.py --count N --out FOLDER [--seed S] [--width 448]
+    python data_samples/mouths/__main__.py --count N --out FOLDER [--seed S] [--jobs J]
 
 Photograph k is `k.jpg`, with its labels (FDI numbers) in `k.png`; `index.json` says what
 each shows.
-The same seed gives the same bytes.
+The same seed gives the same bytes, with any number of jobs.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from functools import partial
+from itertools import chain, count, islice
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +28,31 @@ from .photo import Photograph, photograph
 SHARES = (0.40, 0.22, 0.22, 0.08, 0.08)
 
 
-def photographs(count: int, seed: int, width: int) -> Iterator[tuple[Mouth, Photograph]]:
-    """Yield photographs, three or four of each mouth."""
-    done, number = 0, 0
-    while done < count:
-        rng = np.random.default_rng([seed, number])
-        mouth = random_mouth(rng)
-        for _ in range(int(rng.integers(3, 5))):
-            if done < count:
-                role = str(rng.choice(ROLES, p=SHARES))
-                shape = 0.75 if rng.random() < 0.5 else float(rng.uniform(0.56, 0.95))
-                yield mouth, photograph(mouth, rng, role, width=width, height=round(width * shape))
-                done += 1
-        number += 1
+def photographs_of(number: int, seed: int, width: int) -> list[tuple[Mouth, Photograph]]:
+    """Three or four photographs of one mouth."""
+    rng = np.random.default_rng([seed, number])
+    mouth = random_mouth(rng)
+    result = []
+    for _ in range(int(rng.integers(3, 5))):
+        role = str(rng.choice(ROLES, p=SHARES))
+        shape = 0.75 if rng.random() < 0.5 else float(rng.uniform(0.56, 0.95))
+        photo = photograph(mouth, rng, role, width=width, height=round(width * shape))
+        result.append((mouth, photo))
+    return result
+
+
+def photographs(
+    wanted: int, seed: int, width: int, jobs: int = 1
+) -> Iterator[tuple[Mouth, Photograph]]:
+    """Yield so many photographs, made by so many processes."""
+    made = partial(photographs_of, seed=seed, width=width)
+    if jobs < 2:
+        yield from islice(chain.from_iterable(map(made, count())), wanted)
+        return
+    with get_context("spawn").Pool(jobs, cv2.setNumThreads, (1,)) as pool:
+        # At least three of each mouth; what is too much ends with the pool.
+        mouths = pool.imap(made, range(-(-wanted // 3)))
+        yield from islice(chain.from_iterable(mouths), wanted)
 
 
 def describe(mouth: Mouth, photo: Photograph) -> dict[str, Any]:
@@ -69,10 +84,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=448, help="of the pictures, pixels")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     index = {}
-    for k, (mouth, photo) in enumerate(photographs(options.count, options.seed, options.width)):
+    made = photographs(options.count, options.seed, options.width, options.jobs)
+    for k, (mouth, photo) in enumerate(made):
         cv2.imwrite(
             str(options.out / f"{k}.jpg"), photo.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93]
         )

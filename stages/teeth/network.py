@@ -27,8 +27,8 @@ KINDS = ("front", "right", "left", "upper", "lower", "other")
 #: Brightness 0..1 is brought to about zero mean and unit spread.
 _MEAN, _SPREAD = 0.45, 0.25
 #: Channels of the answer.
-_TOOTH, _INSIDE, _CENTRE, _JAW, _SIDE, _PRIMARY = 0, 1, slice(2, 4), 4, 5, 6
-_POSITION, _BORDER = slice(7, 15), 15
+_TOOTH, _INSIDE, _CENTRE, _BORDER = 0, 1, slice(2, 4), 4
+_JAW, _SIDE, _PRIMARY, _POSITION = 5, 6, 7, slice(8, 16)
 
 
 @dataclass(frozen=True)

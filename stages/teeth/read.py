@@ -29,7 +29,7 @@ _MARGIN_X, _MARGIN_Y = 0.08, 0.10
 #: The first look must find so many crowns for a second one.
 _LEAST_CROWNS = 3
 #: Numbers less probable than this are not kept.
-_LEAST_SHARE = 0.01
+_LEAST_SHARE = 0.001
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ class Example:
         tooth, inside: [h, w] float32 0..1, at half the size.
         border: [h, w] float32: 1 where two crowns touch.
         centre: [2, h, w] float32 offset to the crown's centre in units.
+        crowns: [h, w] uint8 one number per crown, 0: no tooth.
         number: [h, w] uint8 FDI, `UNNUMBERED` or 0.
         valid: [h, w] float32: inside the photograph.
         view, bite: as in `Sample`.
@@ -34,6 +35,7 @@ class Example:
     inside: Array
     border: Array
     centre: Array
+    crowns: npt.NDArray[np.uint8]
     number: npt.NDArray[np.uint8]
     valid: Array
     view: int
@@ -52,7 +54,14 @@ def frame(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
 def _random_frame(sample: Sample, rng: np.random.Generator) -> npt.NDArray[np.float64]:
     height, width = sample.teeth.shape
     x, y, w, h = 0, 0, width, height
-    if rng.random() < 0.5 and sample.teeth.any():
+    sort = rng.random()
+    if sort < 0.15 and sample.teeth.any():
+        # A crown and its neighbours: where nothing can be counted, only looks tell.
+        crown = rng.choice(np.unique(sample.crowns)[1:])
+        x, y, w, h = cv2.boundingRect((sample.crowns == crown).astype(np.uint8))
+        wide = max(w, h) * rng.uniform(3.0, 6.0)
+        x, y, w, h = x + (w - wide) / 2, y + (h - 0.75 * wide) / 2, wide, 0.75 * wide
+    elif sort < 0.6 and sample.teeth.any():
         # As the second look of the reader does it: the teeth fill the picture.
         x, y, w, h = cv2.boundingRect((sample.teeth > 0).astype(np.uint8))
         w, h = w * 1.25, h * 1.25 + 0.1 * w
@@ -213,6 +222,7 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
         inside=inside.astype(np.float32) / 255,
         border=_borders(crowns),
         centre=_offsets(crowns),
+        crowns=np.ascontiguousarray(crowns),
         number=np.ascontiguousarray(number),
         valid=seen[::2, ::2].astype(np.float32),
         view=view,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from network import CHANNELS, HEIGHT, VIEWS, WIDTH, Reader, Residual
+from network import CHANNELS, HEIGHT, VIEWS, WIDTH, Reader, Residual, Wide
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
@@ -55,8 +55,15 @@ class Graph:
             bias = (bias - norm.running_mean) * factor + norm.bias
         pad, stride = layer.kernel_size[0] // 2, layer.stride[0]
         return self.add(
-            "Conv", [x, self.weight(weight), self.weight(bias)],
-            pads=[pad] * 4, strides=[stride] * 2, kernel_shape=list(layer.kernel_size),
+            "Conv", [x, self.weight(weight), self.weight(bias)], pads=[pad] * 4,
+            strides=[stride] * 2, kernel_shape=list(layer.kernel_size), group=layer.groups,
+        )  # fmt: skip
+
+    def doubled(self, x: str) -> str:
+        """Twice as large, bilinear."""
+        return self.add(
+            "Resize", [x, "", self.constant([1, 1, 2, 2])],
+            mode="linear", coordinate_transformation_mode="half_pixel",
         )  # fmt: skip
 
     def block(self, x: str, block: nn.Module) -> str:
@@ -64,6 +71,10 @@ class Graph:
         if isinstance(block, Residual):
             y = self.block(x, block.first)
             y = self.convolution(y, block.second[0], block.second[1])
+            return self.add("Relu", [self.add("Add", [x, y])])
+        if isinstance(block, Wide):
+            y = self.block(self.convolution(x, block.spread[0], block.spread[1]), block.mix)
+            y = self.convolution(y, block.join[0], block.join[1])
             return self.add("Relu", [self.add("Add", [x, y])])
         if isinstance(block, nn.Sequential):
             parts = list(block)
@@ -89,14 +100,14 @@ def to_onnx(net: Reader) -> onnx.ModelProto:
     kind = graph.convolution(whole, net.kind)
     # As large as the level, for a graph without broadcasting: every place adds the same.
     y = graph.add("Add", [y, graph.add("Relu", [graph.convolution(whole, net.context)])])
+    grown = []
     for narrow, up in zip(net.narrow, net.up, strict=True):
-        small = graph.convolution(y, narrow)
-        large = graph.add(
-            "Resize", [small, "", graph.constant([1, 1, 2, 2])],
-            mode="linear", coordinate_transformation_mode="half_pixel",
-        )  # fmt: skip
+        large = graph.doubled(graph.convolution(y, narrow))
         y = graph.block(graph.add("Add", [large, levels.pop()]), up)
-    y = graph.block(y, net.heads)
+        grown.append(y)
+    far, near = graph.doubled(graph.block(grown[1], net.far)), graph.block(grown[2], net.near)
+    meaning = graph.block(graph.add("Add", [far, near]), net.meaning)
+    y = graph.add("Concat", [graph.block(y, net.shape), graph.doubled(meaning)], axis=1)
     graph.nodes.append(helper.make_node("Identity", [y], ["answer"], "answer"))
     graph.nodes.append(helper.make_node("Flatten", [kind], ["kind"], "kind"))
     model = helper.make_model(

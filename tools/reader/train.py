@@ -16,13 +16,33 @@ from pathlib import Path
 import numpy as np
 import torch
 from augment import Example, example
-from network import BORDER, CENTRE, INSIDE, JAW, POSITION, PRIMARY, SIDE, TOOTH, VIEWS, Reader
+from network import (
+    BORDER,
+    CENTRE,
+    INSIDE,
+    JAW,
+    MEANINGS,
+    POSITION,
+    PRIMARY,
+    SHAPES,
+    SIDE,
+    TOOTH,
+    VIEWS,
+    Reader,
+)  # fmt: skip
 from samples import UNNUMBERED, Sample, read_generated, read_labelled
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 #: Primary teeth are rarer among the photographs than among children: each counts as so many.
-PRIMARY_WEIGHT = 4.0
+PRIMARY_WEIGHT = 3.0
+#: How often a photograph is drawn: one whose teeth have numbers, and one of those from the side,
+#: which are rare and show what tells a molar from a premolar.
+NUMBERED, NUMBERED_SIDE = 2.0, 5.0
+#: How often a generated photograph from the side is drawn.
+GENERATED_SIDE = 1.5
+#: Crowns of fewer pixels of the answer teach no numbers.
+LEAST_PIXELS = 12
 
 
 class Stream(torch.utils.data.IterableDataset):
@@ -32,15 +52,22 @@ class Stream(torch.utils.data.IterableDataset):
         self, real: list[Sample], generated: list[Sample], share: float, seed: int
     ) -> None:
         self.real, self.generated, self.share, self.seed = real, generated, share, seed
-        numbered = [(s.teeth[s.teeth > 0] != UNNUMBERED).mean() > 0.5 for s in real]
-        weights = np.where(numbered, 2.0, 1.0)
-        self.weights = weights / weights.sum()
+        sides = {VIEWS.index("right"), VIEWS.index("left")}
+        weights = [
+            (NUMBERED_SIDE if sample.view in sides else NUMBERED)
+            if (sample.teeth[sample.teeth > 0] != UNNUMBERED).mean() > 0.5
+            else 1.0
+            for sample in real
+        ]
+        self.weights = np.array(weights) / sum(weights)
+        made = [GENERATED_SIDE if sample.view in sides else 1.0 for sample in generated]
+        self.made_weights = np.array(made) / max(sum(made), 1.0)
 
     def __iter__(self):
         rng = np.random.default_rng(self.seed)
         while True:
             if self.generated and rng.random() < self.share:
-                sample = self.generated[rng.integers(len(self.generated))]
+                sample = self.generated[rng.choice(len(self.generated), p=self.made_weights)]
             else:
                 sample = self.real[rng.choice(len(self.real), p=self.weights)]
             yield example(sample, rng)
@@ -48,16 +75,38 @@ class Stream(torch.utils.data.IterableDataset):
 
 def collate(examples: list[Example]) -> dict[str, Tensor]:
     """Examples side by side."""
-    fields = ("image", "tooth", "inside", "border", "centre", "number", "valid", "view", "bite")
+    fields = (
+        "image", "tooth", "inside", "border", "centre", "crowns", "number", "valid", "view", "bite",
+    )  # fmt: skip
     return {
         name: torch.from_numpy(np.stack([np.asarray(getattr(e, name)) for e in examples]))
         for name in fields
     }
 
 
+def crown_means(answer: Tensor, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """What is said of each crown that has a number, as the reader pools it.
+
+    Returns:
+        [n, 11] means of the logits over the crowns, and their [n] FDI numbers.
+    """
+    count = len(answer)
+    place = batch["crowns"].long() + 256 * torch.arange(count)[:, None, None]
+    weight = (batch["inside"] + 1e-3) * (batch["crowns"] > 0)
+    sums = torch.zeros(256 * count, MEANINGS + 1)
+    logits = torch.cat([answer[:, SHAPES:], torch.ones_like(answer[:, :1])], 1)
+    logits = logits.permute(0, 2, 3, 1).reshape(-1, MEANINGS + 1) * weight.reshape(-1, 1)
+    sums = sums.index_add(0, place.reshape(-1), logits)
+    pixels = torch.bincount(place.reshape(-1), minlength=256 * count)
+    number = torch.zeros(256 * count, dtype=torch.long)
+    number[place.reshape(-1)] = batch["number"].long().reshape(-1)
+    chosen = (pixels >= LEAST_PIXELS) & (number > 0) & (number != UNNUMBERED)
+    return sums[chosen, :MEANINGS] / sums[chosen, MEANINGS:], number[chosen]
+
+
 def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """The parts of the loss, weighted."""
-    tooth, valid, number = batch["tooth"], batch["valid"], batch["number"].long()
+    tooth, valid = batch["tooth"], batch["valid"]
     logit = answer[:, TOOTH]
     entropy = F.binary_cross_entropy_with_logits(logit, tooth, reduction="none")
     share = torch.sigmoid(logit) * valid
@@ -66,36 +115,33 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
     border = F.binary_cross_entropy_with_logits(
         answer[:, BORDER], batch["border"], reduction="none", pos_weight=torch.tensor(4.0)
     )
-    on_tooth = (number > 0).float()
-    area = on_tooth.sum().clamp(min=1)
+    on_tooth = (batch["number"] > 0).float()
     centre = (answer[:, CENTRE] - batch["centre"]).abs().sum(1) * on_tooth
-    numbered = (number > 0) & (number != UNNUMBERED)
-    chosen = numbered.float()
-    count = chosen.sum().clamp(min=1)
-    quadrant, place = number // 10, number % 10
-
-    def binary(channel: int, truth: Tensor, weight: float = 1.0) -> Tensor:
-        wrong = F.binary_cross_entropy_with_logits(
-            answer[:, channel], truth.float(), reduction="none", pos_weight=torch.tensor(weight)
-        )
-        return (wrong * chosen).sum() / count
-
-    position = F.cross_entropy(
-        answer[:, POSITION],
-        torch.where(numbered, (place - 1).clamp(0, 7), -100),
-        ignore_index=-100, label_smoothing=0.05, reduction="sum",
-    )  # fmt: skip
     result = {
         "tooth": (entropy * valid).mean() + 0.5 * dice.mean(),
         "inside": 2 * inside.mean(),
         "border": 0.5 * (border * valid).mean(),
-        "centre": 0.2 * centre.sum() / area,
-        "jaw": 0.3 * binary(JAW, (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)),
-        "side": 0.3
-        * binary(SIDE, (quadrant == 2) | (quadrant == 3) | (quadrant == 6) | (quadrant == 7)),
-        "primary": 0.3 * binary(PRIMARY, quadrant >= 5, PRIMARY_WEIGHT),
-        "position": 0.3 * position / count,
+        "centre": 0.2 * centre.sum() / on_tooth.sum().clamp(min=1),
     }
+    means, number = crown_means(answer, batch)
+    if len(number):
+        quadrant = number // 10
+
+        def binary(channel: int, truth: Tensor, weight: float = 1.0) -> Tensor:
+            return F.binary_cross_entropy_with_logits(
+                means[:, channel - SHAPES], truth.float(), pos_weight=torch.tensor(weight)
+            )
+
+        left = (quadrant == 2) | (quadrant == 3) | (quadrant == 6) | (quadrant == 7)
+        lower = (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)
+        places = means[:, POSITION.start - SHAPES : POSITION.stop - SHAPES]
+        result |= {
+            "jaw": 0.3 * binary(JAW, lower),
+            "side": 0.3 * binary(SIDE, left),
+            "primary": 0.3 * binary(PRIMARY, quadrant >= 5, PRIMARY_WEIGHT),
+            "position": 0.6
+            * F.cross_entropy(places, (number % 10 - 1).clamp(0, 7), label_smoothing=0.02),
+        }
     if (batch["view"] >= 0).any():
         views = torch.where(batch["view"] >= 0, batch["view"], -100)
         result["view"] = 0.1 * F.cross_entropy(kind[:, : len(VIEWS)], views, ignore_index=-100)
@@ -115,21 +161,24 @@ def validate(net: Reader, batch: dict[str, Tensor]) -> str:
     found = (answer[:, TOOTH] > 0) & (batch["valid"] > 0)
     truth = batch["tooth"] > 0.5
     iou = (found & truth).sum((1, 2)) / (found | truth).sum((1, 2)).clamp(min=1)
-    number = batch["number"].long()
-    numbered = (number > 0) & (number != UNNUMBERED)
+    means, number = crown_means(answer.float(), batch)
     quadrant = number // 10
     lower = (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)
     left = (quadrant == 2) | (quadrant == 3) | (quadrant == 6) | (quadrant == 7)
+    places = means[:, POSITION.start - SHAPES : POSITION.stop - SHAPES].argmax(1) + 1
+    back = number % 10 >= 4
 
     def right(guess: Tensor, truth: Tensor) -> float:
-        return float((guess == truth)[numbered].float().mean())
+        return float((guess == truth).float().mean())
 
-    position = answer[:, POSITION].argmax(1)
     view = kind[:, : len(VIEWS)].argmax(1) == batch["view"]
     return (
         f"IoU {iou.median():.3f}/{iou.quantile(0.1):.3f} "
-        f"jaw {right(answer[:, JAW] > 0, lower):.3f} side {right(answer[:, SIDE] > 0, left):.3f} "
-        f"place {right(position, number % 10 - 1):.3f} "
+        f"jaw {right(means[:, JAW - SHAPES] > 0, lower):.3f} "
+        f"side {right(means[:, SIDE - SHAPES] > 0, left):.3f} "
+        f"primary {right(means[:, PRIMARY - SHAPES] > 0, quadrant >= 5):.3f} "
+        f"place {right(places, number % 10):.3f} "
+        f"(back {right(places[back], number[back] % 10):.3f}) "
         f"view {view[batch['view'] >= 0].float().mean():.3f}"
     )
 
@@ -139,7 +188,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of teeth_labelled")
     parser.add_argument("--labels", type=Path, help="further tooth numbers (as fdi.json)")
     parser.add_argument("--mouths", type=Path, help="folder of generated mouths")
-    parser.add_argument("--share", type=float, default=0.3, help="share of generated mouths")
+    parser.add_argument("--share", type=float, default=0.4, help="share of generated mouths")
     parser.add_argument("--out", type=Path, default=Path("reader.pt"))
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--steps", type=int, default=9000)
