@@ -17,7 +17,13 @@ from stages.init.dental.surface.chart import (
     unroll,
 )
 from stages.init.dental.surface.charts import teeth_present
-from stages.init.dental.surface.colour import even_rim, find_gains, hidden_edges, spread_colour
+from stages.init.dental.surface.colour import (
+    blend,
+    even_rim,
+    find_gains,
+    hidden_edges,
+    spread_colour,
+)
 from stages.init.dental.surface.crown_shape import crown_points, crown_radius, jaw_shape
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
@@ -330,3 +336,27 @@ def test_hidden_edges_go_on_a_little_and_only_on_crowns() -> None:
     assert not hidden[34:].any()
     assert not hidden[:, 20:].any()
     assert not (hidden & tooth).any()
+
+
+def test_under_a_highlight_lies_the_shade_around_it() -> None:
+    """Of the photograph itself: the other one, darker, only lends what is under the light."""
+    density = 10.0
+    y, x = np.mgrid[:120, :160]
+    lit = (x - 80) ** 2 + (y - 60) ** 2 < 8**2
+    stripes = np.where((x // 3) % 2, 0.02, -0.02).astype(np.float32)
+    front, side = 0.8 + stripes, 0.4 + stripes
+    front[lit] = 1.0
+    colours = [np.repeat(c[..., None], 3, 2).astype(np.float32) for c in (front, side)]
+    weights = [np.where(lit, 0.001, 1.0), np.full(lit.shape, 0.05)]
+    mixed, total = blend(colours, [w.astype(np.float32) for w in weights], np.ones((2, 3)), density)
+    assert abs(mixed[lit].mean() - mixed[~lit].mean()) < 0.03
+    assert mixed[lit].std() == pytest.approx(0.02, abs=0.01)
+    assert total[60, 80] == pytest.approx(0.051)
+
+
+def test_one_photograph_alone_keeps_its_colours() -> None:
+    rng = np.random.default_rng(0)
+    colour = rng.uniform(0.2, 0.8, (50, 90, 3)).astype(np.float32)
+    shown = np.ones((50, 90), np.float32)
+    mixed, _ = blend([colour, 0 * colour], [shown, 0 * shown], np.ones((2, 3)), 8.0)
+    np.testing.assert_allclose(mixed, colour, atol=1e-5)

@@ -98,7 +98,7 @@ def coloured_cloud(
     start = 0
     for layer in layers:
         colours = [showing.colour for showing in layer.showings]
-        colour, total = blend(colours, layer.weights, gains)
+        colour, total = blend(colours, layer.weights, gains, layer.grid.density)
         shown = layer.kept & (total > 0)
         behind = _behind_other_jaw(layer, charts, photos, threads)
         crowns = behind & within_crowns(layer.grid, layer.chart.shape)

@@ -31,6 +31,10 @@ _LEAST_VOTE = 0.02
 _RAGGED = 0.8
 #: The gum's rim is made even over this length of the arch (mm).
 _EVEN = 4.0
+#: Shades are what varies over more than this (mm): a highlight on a crown is smaller.
+_SHADE = 2.0
+#: Weights below this are none.
+_LEAST_WEIGHT = np.float32(1e-9)
 #: A gain from fewer common samples than this is not believed.
 _LEAST_COMMON = 200
 #: Gains are kept within this factor: beyond, something else is wrong.
@@ -223,16 +227,47 @@ def find_gains(colours: list[list[Array32]], weights: list[list[Array32]], ancho
 
 
 def blend(
-    colours: list[Array32], weights: list[Array32], gains: Array64
+    colours: list[Array32], weights: list[Array32], gains: Array64, density: float
 ) -> tuple[Array32, Array32]:
-    """Weighted mean colour [H, W, 3] float32 in 0..1, and the sum of weights [H, W]."""
+    """Colour [H, W, 3] float32 in 0..1 from all photographs, and the sum of their weights [H, W].
+
+    Shades and detail are taken apart (Burt and Adelson, A multiresolution spline with application
+    to image mosaics, 1983, with two bands). The shade under a highlight is that of the same
+    photograph around it: another photograph lends the detail, but sees the place from its side,
+    darker.
+
+    Args:
+        colours, weights: per photograph [H, W, 3] and [H, W].
+        gains: [V, 3] factors of the photographs.
+        density: samples per mm.
+    """
     total = np.zeros(weights[0].shape, np.float32)
-    mean = np.zeros((*total.shape, 3), np.float32)
+    detail = np.zeros((*total.shape, 3), np.float32)
+    shade, around = np.zeros_like(detail), np.zeros_like(total)
     for colour, weight, gain in zip(colours, weights, gains, strict=True):
-        mean += weight[..., None] * (colour * gain.astype(np.float32))
+        own = colour * gain.astype(np.float32)
+        reach = _widely(weight, density)
+        smooth = _widely(own * weight[..., None], density) / (reach + _LEAST_WEIGHT)[..., None]
+        detail += weight[..., None] * (own - smooth)
         total += weight
-    mean /= np.maximum(total, np.float32(1e-12))[..., None]
-    return np.clip(mean, 0, 1), total
+        shade += reach[..., None] * smooth
+        around += reach
+    detail /= np.maximum(total, _LEAST_WEIGHT)[..., None]
+    shade /= np.maximum(around, _LEAST_WEIGHT)[..., None]
+    return np.clip(shade + detail, 0, 1), total
+
+
+def _widely(values: Array32, density: float) -> Array32:
+    """Values [H, W] or [H, W, C] blurred over `_SHADE` mm."""
+    height, width = values.shape[:2]
+    step = max(int(_SHADE * density / 4), 1)
+    size = (max(width // step, 1), max(height // step, 1))
+    small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    sigma = _SHADE * density / step
+    blurred = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(
+        cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
+    )
 
 
 def hidden_edges(tooth: Mask, crowns: Mask, density: float, length: float) -> Mask:
