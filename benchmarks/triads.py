@@ -12,7 +12,8 @@ pass like the case itself. --series gives whole folders. OUT gets `triads.json` 
 that were accepted) and `readings/`, which makes the next run quicker: readings count again where
 neither the photograph nor the reader has changed.
 
-Found: a truth point lies inside a crown. Right: that crown has the point's number. Points on crowns
+Found: a truth point lies inside a crown. Right: that crown has the point's number. A wrong number
+that is shown as doubtful is listed (with ?), but does not make a scene wrong. Points on crowns
 that are partly seen count apart. Epipolar errors are of zeniths and papillae with numbers that two
 photographs share, under the cameras found.
 """
@@ -45,6 +46,7 @@ from triads_scores import (
     leave_one_out,
     lowest_threshold,
     score_item,
+    unmarked,
 )
 
 Line = Callable[[Row], str]
@@ -77,7 +79,7 @@ def case_line(row: Row) -> str:
     """One line of the table of cases."""
     whole, partial, epipolar = row["whole"], row["partial"], row.get("epipolar")
     wrong = ", ".join(
-        f"{w['photo'][0]}: {w['truth']} named {w['said']}" + ("?" if w["doubt"] > 0.2 else "")
+        f"{w['photo'][0]}: {w['truth']} named {w['said']}" + ("" if unmarked(w) else "?")
         for w in row["wrong"][:LISTED]
     )
     if len(row["wrong"]) > LISTED:
@@ -132,6 +134,9 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         "cases": len(cases),
         "accepted": len(passed),
         "accepted_with_a_wrong_number": sum(bool(row["wrong"]) for row in passed),
+        "accepted_with_one_that_is_not_marked": sum(
+            any(unmarked(entry) for entry in row["wrong"]) for row in passed
+        ),
         "right_numbers_refused": sum(row["right"] for row in cases if not row["accepted"]),
         "points_found_in_all": _share(cases, "found"),
         "points_right_in_all": _share(cases, "right"),

@@ -119,13 +119,7 @@ class Runner:
             )  # fmt: skip
             view = prepared_views(loaded)[0]
             if photo.mirrored:
-                turned = np.array([[-1.0, 0, view.width], [0, 1, 0], [0, 0, 1]])
-                view = replace(
-                    view,
-                    image=np.ascontiguousarray(view.image[:, ::-1]),
-                    mask=None if view.mask is None else np.ascontiguousarray(view.mask[:, ::-1]),
-                    working_from_source=turned @ view.working_from_source,
-                )
+                view = view.mirrored()
             self._photos[key] = view
         return self._photos[key]
 

@@ -14,6 +14,7 @@ from triads_run import Outcome
 
 from pipeline.artifacts.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
+from stages.geometry.teeth_overlay import DOUBT_SHOWN
 
 if TYPE_CHECKING:
     from stages.init.dental.solution import PlacedView
@@ -27,8 +28,9 @@ LEAST_LANDMARKS = 4
 def score_item(item: Item, outcome: Outcome) -> Row:
     """The figures of one item, ready for JSON.
 
-    `right`: no truth point carries a wrong number, all photographs are of one patient and closed,
-    and at least one truth point is found; what a scene of it must be to be shown.
+    `right`: no truth point carries a wrong number that is not marked as doubtful, all photographs
+    are of one patient and closed, and at least one truth point is found; what a scene of it must be
+    to be shown.
     """
     photos = _photos_by_view(item, outcome)
     numbered = outcome.teeth.by_name() if outcome.teeth else {}
@@ -55,7 +57,7 @@ def score_item(item: Item, outcome: Outcome) -> Row:
         "patients": sorted(item.patients),
         "accepted": outcome.accepted,
         "why_not": "" if outcome.accepted else outcome.message,
-        "right": bool(together and not wrong and whole["found"]),
+        "right": bool(together and whole["found"] and not any(unmarked(one) for one in wrong)),
         "one_closed_mouth": together,
         **counts,
         "wrong": wrong,
@@ -79,6 +81,11 @@ def score_item(item: Item, outcome: Outcome) -> Row:
     return row
 
 
+def unmarked(entry: Row) -> bool:
+    """Does a wrong number stand there as if it were sure?"""
+    return entry["doubt"] <= DOUBT_SHOWN
+
+
 def _photos_by_view(item: Item, outcome: Outcome) -> dict[str, Photo]:
     """View name -> the photograph."""
     by_stem = {photo.shown: photo for photo in item.photos}
@@ -97,7 +104,7 @@ def _zeros() -> dict[str, int]:
 
 
 def score_points(
-    dentition: Dentition, truth: Sequence[TruthPoint], mirrored: bool, marked: float = 0.2
+    dentition: Dentition, truth: Sequence[TruthPoint], mirrored: bool
 ) -> tuple[dict[str, dict[str, int]], list[Row]]:
     """Count truth points that lie in a crown, and those whose crown has the right number.
 
@@ -105,7 +112,6 @@ def score_points(
         dentition: of the photograph.
         truth: its points.
         mirrored: the photograph is that of the truth, mirrored.
-        marked: numbers with more doubt than this are marked as doubtful.
 
     Returns:
         The counts of `whole` and `partial` points, and the whole ones that carry a wrong number.
@@ -129,7 +135,7 @@ def score_points(
         if said and not right:
             surest = min(said, key=lambda crown: crown.doubt)
             count["wrong"] += 1
-            count["wrong_but_marked"] += surest.doubt > marked
+            count["wrong_but_marked"] += surest.doubt > DOUBT_SHOWN
             if not point.partial:
                 wrong.append(
                     {"truth": point.numbers[0], "said": surest.number, "doubt": surest.doubt}
