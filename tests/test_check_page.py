@@ -7,15 +7,17 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.artifacts.corrections import read_corrections
+from pipeline.artifacts.corrections import Corrections, read_corrections
 from pipeline.artifacts.teeth import Teeth
 from pipeline.report import run_report
 from pipeline.store import Store
 from stages.geometry.corrections import apply_corrections
+from stages.geometry.crowns import mirrored_dentition
 from tests import teeth_case as case
 from tests.browser import browse, console, needs_chromium
 from tests.report_case import write_result
@@ -35,7 +37,7 @@ def doubtful_case(folder: Path, teeth: Teeth | None = None, failure: str = "Doub
     return folder
 
 
-def data_of(page: str) -> dict[str, object]:
+def data_of(page: str) -> dict[str, Any]:
     found = re.search(r'id="data">(.*?)</script>', page, re.S)
     assert found
     return json.loads(found[1])
@@ -97,7 +99,8 @@ def test_a_wrong_file_is_said_on_the_page(tmp_path: Path, text: str) -> None:
     assert "could not be drawn" not in (workspace / "report.html").read_text()
 
 
-PROBE = """<script>
+#: What every script on the page begins and ends with.
+BEGIN = """<script>
 (async () => {
   const result = {};
   const wait = (ms = 50) => new Promise((done) => setTimeout(done, ms));
@@ -109,6 +112,24 @@ PROBE = """<script>
     new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...more }));
   const row = (k) => all(".chip", card(k)).map((entry) => entry.textContent);
   const notes = (k) => card(k).querySelector(".notes").textContent;
+"""
+SAVE = """
+  window.showSaveFilePicker = undefined;
+  window.Blob = class { constructor(parts) { result.yaml = parts.join(""); } };
+  URL.createObjectURL = () => "blob:x";
+  HTMLAnchorElement.prototype.click = function () { result.download = this.download; };
+  document.getElementById("save").click();
+  await wait();
+"""
+END = """
+  const text = document.createElement("pre");
+  text.id = "result";
+  text.textContent = JSON.stringify(result);
+  document.body.append(text);
+})();
+</script></body>"""
+
+PROBE = """
   result.cards = all("article").length;
   result.left = all("#aside figure").map((entry) => entry.textContent);
   result.rest = document.getElementById("panel").textContent;
@@ -150,45 +171,34 @@ PROBE = """<script>
   all("#aside button")[0].click();
   all(".head button", card(2)).find((entry) => /All numbers/.test(entry.textContent)).click();
   result.cards += all("article").length;
-
-  window.showSaveFilePicker = undefined;
-  window.Blob = class { constructor(parts) { result.yaml = parts.join(""); } };
-  URL.createObjectURL = () => "blob:x";
-  HTMLAnchorElement.prototype.click = function () { result.download = this.download; };
-  document.getElementById("save").click();
-  await wait();
+"""
+SAVED = """
   result.next = document.getElementById("next").textContent;
   result.overflow = document.documentElement.scrollWidth - innerWidth;
   result.requests = performance.getEntriesByType("resource").map((entry) => entry.name)
     .filter((name) => !name.startsWith("data:"));
-  const text = document.createElement("pre");
-  text.id = "result";
-  text.textContent = JSON.stringify(result);
-  document.body.append(text);
-})();
-</script></body>"""
+"""
+READ = "result.yaml = check.yaml();"
 
 
-READ = """<script>
-const text = document.createElement("pre");
-text.id = "result";
-text.textContent = check.yaml();
-document.body.append(text);
-</script></body>"""
+def probed(workspace: Path, folder: Path, *script: str) -> dict[str, Any]:
+    """What a script finds on the page of a case."""
+    run_report(workspace)
+    page = workspace / "check.html"
+    page.write_text(page.read_text().replace("</body>", "".join([BEGIN, *script, END])))
+    folder.mkdir(exist_ok=True)
+    dom, log = browse(page, folder, (1300, 900), "--dump-dom")
+    assert console(log) == []
+    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
+    assert found
+    result: dict[str, Any] = json.loads(html.unescape(found[1]))
+    return result
 
 
 @needs_chromium
 def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
     workspace = doubtful_case(tmp_path / "a case")
-    (tmp_path / "browser").mkdir()
-    run_report(workspace)
-    page = workspace / "check.html"
-    page.write_text(page.read_text().replace("</body>", PROBE))
-    dom, log = browse(page, tmp_path / "browser", (1300, 900), "--dump-dom")
-    assert console(log) == []
-    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
-    assert found
-    result = json.loads(html.unescape(found[1]))
+    result = probed(workspace, tmp_path / "browser", PROBE, SAVE, SAVED)
     assert result["cards"] == 2 + 3
     assert result["left"] == ["2_<left>.jpgit is <b>blurred</b>Use it"]
     assert "Nothing looks wrong" in result["rest"]
@@ -226,7 +236,109 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
     again = data_of((workspace / "check.html").read_text())["photographs"]
     assert [len(photo["earlier"]["crowns"]) for photo in again] == [2, 8, 12]
     assert again[2]["earlier"]["use"] is True
-    page.write_text(page.read_text().replace("</body>", READ))
-    dom, _ = browse(page, tmp_path / "browser", (1300, 900), "--dump-dom")
-    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
-    assert found and html.unescape(found[1]) == result["yaml"]
+    assert probed(workspace, tmp_path / "browser", READ) == {"yaml": result["yaml"]}
+
+
+#: The first photograph shows four teeth of a jaw in its left half; of the second, init has found
+#: that it is a mirror image.
+TAKEN = ((14, 13, 12, 11), (44, 43, 42, 41))
+
+
+def mirrored_case(folder: Path) -> tuple[Path, Teeth]:
+    """A workspace with what init found, and the teeth as they were read from the photographs."""
+    side = case.dentition("000", "right", *TAKEN)
+    sure, said = side.upper[1:3]
+    upper = (
+        side.upper[0], replace(sure, doubt=1e-4), replace(said, number=62, doubt=0.0), side.upper[3]
+    )  # fmt: skip
+    read = Teeth((replace(side, upper=upper), case.dentition("001", "front", (12, 11), (42, 41))))
+    found = Teeth((read.views[0], mirrored_dentition(read.views[1])))
+    return doubtful_case(folder, found), read
+
+
+def test_the_page_knows_mirror_images(tmp_path: Path) -> None:
+    workspace, _ = mirrored_case(tmp_path / "case")
+    case.write(workspace / "teeth.yaml", "photographs: {0_right.jpg: {mirrored: false}}")
+    run_report(workspace)
+    first, second, third = data_of((workspace / "check.html").read_text())["photographs"]
+    assert [photo["mirrored"] for photo in (first, second, third)] == [False, True, False]
+    said = [photo["earlier"]["mirrored"] for photo in (first, second, third)]
+    assert said == [False, None, None]
+    assert [crown["doubt"] for crown in first["crowns"][:4]] == [0.05, 0.001, 0, 0.05]
+    assert [crown["number"] for crown in second["crowns"]] == [21, 22, 31, 32]
+
+
+TURN = """
+  const over = (k) => all(".head button", card(k))
+    .find((entry) => entry.textContent === "Mirror image");
+  const seen = (k) => [row(k).join(" "), over(k).getAttribute("aria-pressed"),
+    card(k).querySelector("image").getAttribute("transform"), card(k).querySelector("select").value,
+    notes(k).includes("shown turned over")];
+  const inside = (k) => {
+    const { x, width } = card(k).querySelector("svg").viewBox.baseVal;
+    return all("polygon", card(k)).every((polygon) => [...polygon.points]
+      .every((point) => point.x > x && point.x < x + width)) && width < 299;
+  };
+  result.start = [seen(0), seen(1)];
+  over(0).click();
+  result.turned = seen(0);
+  const file = () => check.yaml().split("\\n").slice(1).join("|");
+  result.files = [file()];
+  result.near = inside(0);
+  over(0).click();
+  result.back = seen(0);
+  result.files.push(file());
+  result.near &&= inside(0);
+  press("z", { ctrlKey: true });
+  result.undone = seen(0);
+  result.near &&= inside(0);
+  all(".chip", card(0))[3].click();
+  press("2"); press("5");
+  press("2"); press("4");
+  chip(0, "31").click();
+  deed("Split").click();
+  press("Enter");
+  press("3"); press("1");
+  all(".chip", card(1))[0].click();
+  press("6"); press("1");
+  result.end = [row(0).join(" "), row(1).join(" ")];
+"""
+
+
+@needs_chromium
+def test_a_mirror_image_is_turned_over_in_a_browser(tmp_path: Path) -> None:
+    workspace, read = mirrored_case(tmp_path / "case")
+    result = probed(workspace, tmp_path / "browser", TURN, SAVE)
+    as_taken = ["14 13 62 11 44 43 42 41", "false", "", "right", False]
+    over = f"translate({case.WIDTH} 0) scale(-1 1)"
+    as_turned = ["21 62 23 24 31 32 33 34", "true", over, "left", True]
+    assert result["start"] == [as_taken, ["21 22 31 32", "true", over, "front", True]]
+    assert result["turned"] == result["undone"] == as_turned
+    assert result["back"] == as_taken
+    assert result["near"] is True
+    assert result["files"] == [
+        f'photographs:|  "0_right.jpg":|    mirrored: {said}|' for said in ("true", "false")
+    ]
+    assert result["end"] == ["21 62 23 24 31 ? 32 33 34", "61 22 31 32"]
+
+    said = read_corrections(case.write(workspace / "teeth.yaml", result["yaml"])).photographs
+    first, second = said["0_right.jpg"], said["1_front.jpg"]
+    assert (first.mirrored, first.kind, first.use) == (True, None, None)
+    assert second.mirrored is True, "its number is that of the picture turned over"
+    number, split, part = first.crowns
+    assert (number.tooth, part.tooth, second.crowns[0].tooth) == (24, 31, 61)
+    # Places are those of the photograph as it was taken: what is on the right there is on the left.
+    assert number.at == pytest.approx(case.original(0, "upper"), abs=1)
+    assert split.at == pytest.approx(case.original(3, "lower"), abs=1)
+    assert part.at[0] > split.at[0]
+    assert second.crowns[0].at == pytest.approx(case.original(1, "upper"), abs=1)
+
+    after = apply_corrections(read, case.views(), Corrections(said)).views
+    rows = [" ".join(str(crown.number or "?") for crown in view.all_crowns) for view in after]
+    assert rows == result["end"]
+    assert [(view.mirrored, view.kind) for view in after] == [(True, "left"), (True, "front")]
+
+    # A second look: all stays as it was said.
+    Store(workspace).keep_evidence("init", {}, {"teeth": Teeth(after)})
+    again = probed(workspace, tmp_path / "browser", READ, "result.row = row(0).join(' ');")
+    assert again == {"yaml": result["yaml"], "row": result["end"][0]}

@@ -6,6 +6,7 @@
       0_right.jpg:
         use: true
         kind: right
+        mirrored: false
         crowns:
           - {at: [412, 300], tooth: 16}
           - {at: [80.5, 310], remove: true}
@@ -61,12 +62,14 @@ class PhotoCorrection:
 
     Attributes:
         use: False: leave it out; True: use it although it was set aside.
-        kind: what it shows.
+        kind: what it shows, turned back where it is mirrored.
+        mirrored: it is a mirror image, or is none.
         crowns: in the order in which they are put right.
     """
 
     use: bool | None = None
     kind: Kind | None = None
+    mirrored: bool | None = None
     crowns: tuple[CrownCorrection, ...] = ()
 
 
@@ -128,10 +131,11 @@ def read_corrections(path: Path) -> Corrections:
 
 
 def _photo(entry: object, where: str) -> PhotoCorrection:
-    given = _mapping(entry, where, ("use", "kind", "crowns"))
+    given = _mapping(entry, where, ("use", "kind", "mirrored", "crowns"))
     use, kind, crowns = given.get("use"), given.get("kind"), given.get("crowns")
-    if not isinstance(use, bool | None):
-        raise RequestError(f"{where}: use must be true or false, not {_shown(use)}.")
+    for name in ("use", "mirrored"):
+        if not isinstance(given.get(name), bool | None):
+            raise RequestError(f"{where}: {name} must be true or false, not {_shown(given[name])}.")
     if kind is not None and kind not in KINDS:
         hint = nearest(kind, KINDS) if isinstance(kind, str) else ""
         raise RequestError(
@@ -141,7 +145,7 @@ def _photo(entry: object, where: str) -> PhotoCorrection:
     if not isinstance(crowns, list | None):
         raise RequestError(f"{where}: crowns must be a list (- {{at: [x, y], tooth: 16}}).")
     made = [_crown(item, f"{where}, crowns[{k}]") for k, item in enumerate(crowns or [])]
-    return PhotoCorrection(use, kind, tuple(made))
+    return PhotoCorrection(use, kind, given.get("mirrored"), tuple(made))
 
 
 def _crown(entry: object, where: str) -> CrownCorrection:

@@ -55,6 +55,12 @@ def is_left(tooth: int) -> bool:
     return 20 < permanent_of(tooth) < 40
 
 
+def other_side(tooth: int) -> int:
+    """The tooth in the same place on the other side: 21 for 11, 75 for 85."""
+    quadrant, place = divmod(tooth, 10)
+    return 10 * (quadrant + 1 if quadrant % 2 else quadrant - 1) + place
+
+
 def universal_number(tooth: int) -> str:
     """A tooth's number in the Universal system (ADA): "8" for 11, "E" for 51.
 

@@ -44,7 +44,7 @@ class Crown:
         doubtful: its outline is weak: at the border of the image, or hardly told from the rest.
         outline: [K, 2] polygon around it.
         score: 0..1, how sure the reader is that this is one crown.
-        numbers: FDI number -> probability by this photograph alone (those of .01 and more).
+        numbers: FDI number -> probability by this photograph alone (those of .001 and more).
         number: FDI number given to it, 0: none.
         doubt: 0..1 that `number` is wrong.
     """
@@ -88,6 +88,8 @@ class Dentition:
         jaws_apart: 0..1, how far the jaws are certainly not in contact.
         set_aside: why the photograph takes no part in the reconstruction; empty: it does.
         doubts: sentences for the user about what is not as expected; empty where all is well.
+        mirrored: True: the photograph is a mirror image, and what is said here is of the picture
+            turned back. False: a person said that it is none. None: nobody asked.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Dentition:
     jaws_apart: float = 0.0
     set_aside: str = ""
     doubts: tuple[str, ...] = ()
+    mirrored: bool | None = None
 
     def crowns(self, jaw: Jaw) -> tuple[Crown, ...]:
         """The crowns of one jaw, from left to right."""
@@ -190,6 +193,7 @@ def _view_entry(view: Dentition) -> dict[str, Any]:
         "jaws_apart": round(float(view.jaws_apart), _PROBABILITY_DECIMALS),
         "set_aside": view.set_aside,
         "doubts": list(view.doubts),
+        "mirrored": view.mirrored,
         "crowns": [_crown_entry(crown) for crown in view.all_crowns],
     }
 
@@ -231,6 +235,7 @@ def _view(entry: Mapping[str, Any]) -> Dentition:
         jaws_apart=entry["jaws_apart"],
         set_aside=entry["set_aside"],
         doubts=tuple(entry["doubts"]),
+        mirrored=entry.get("mirrored"),
     )
 
 

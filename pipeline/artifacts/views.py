@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -63,6 +63,16 @@ class View:
         linear = self.working_from_source[:2, :2]
         lying = abs(linear[0, 1]) > abs(linear[0, 0])  # stored on its side
         return (height, width) if lying else (width, height)
+
+    def mirrored(self) -> View:
+        """The picture turned over, left for right."""
+        turned = np.array([[-1.0, 0, self.width], [0, 1, 0], [0, 0, 1]])
+        return replace(
+            self,
+            image=np.ascontiguousarray(self.image[:, ::-1]),
+            mask=None if self.mask is None else np.ascontiguousarray(self.mask[:, ::-1]),
+            working_from_source=turned @ self.working_from_source,
+        )
 
     def gray(self) -> npt.NDArray[np.uint8]:
         """[H, W] uint8 luma, as feature detectors and optical flow want it."""

@@ -19,9 +19,10 @@ let nextId = 0;
 const withId = (crown) => ({ ...crown, id: nextId++ });
 const photos = data.photographs.map((photo) => ({
   ...photo, crowns: photo.crowns.map(withId), entries: photo.earlier.crowns,
-  use: photo.earlier.use, kindSaid: photo.earlier.kind,
+  use: photo.earlier.use, kindSaid: photo.earlier.kind, mirroredSaid: photo.earlier.mirrored,
 }));
-const changing = ["crowns", "entries", "use", "kindSaid"];
+const changing = ["crowns", "entries", "use", "kindSaid", "kind", "mirrored",
+  "mirroredSaid", "roll"];
 const past = [];
 let saved = yamlOf(photos);
 let savedOnce = false;
@@ -54,8 +55,8 @@ const undo = () => {
 };
 const put = (photo, crown, number) => {
   // An earlier number of the same crown is replaced; a split before it stays.
-  photo.entries = photo.entries.filter((entry) => !entry.tooth || !contains(crown.outline,
-    entry.at.map((value, axis) => value / photo.scale[axis])));
+  photo.entries = photo.entries.filter((entry) => !entry.tooth
+    || !contains(crown.outline, shownAt(photo, entry.at)));
   photo.entries = [...photo.entries,
     { at: original(photo, innerPoint(crown.outline)), tooth: number }];
   photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
@@ -105,6 +106,20 @@ const remove = () => {
     chosen = near ? { photo, id: near.id } : null;
   });
   say("Removed: it is no tooth.");
+};
+const turnOver = (photo) => {
+  change(() => {
+    photo.mirrored = !photo.mirrored;
+    photo.mirroredSaid = photo.mirrored;
+    photo.roll = -photo.roll;
+    photo.kind = { right: "left", left: "right" }[photo.kind] ?? photo.kind;
+    photo.crowns = photo.crowns.map((crown) => ({ ...crown,
+      outline: crown.outline.map(([x, y]) => [photo.width - x, y]),
+      number: crown.number && crown.doubt ? otherSide(crown.number) : crown.number,
+      offered: crown.offered.map(([tooth, share]) => [otherSide(tooth), share]) }));
+  });
+  say(photo.mirrored ? `${photo.name} is taken as a mirror image and turned over.`
+    : `${photo.name} is taken as it is.`);
 };
 const startCut = () => {
   const crown = chosenCrown();

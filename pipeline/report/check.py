@@ -117,6 +117,7 @@ def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrectio
         "width": view.width,
         "height": view.height,
         "scale": [upright[0] / view.width, upright[1] / view.height],
+        "mirrored": bool(seen.mirrored),
         "roll": round(float(seen.roll), 4),
         "kind": seen.kind,
         "aside": seen.set_aside or ("" if seen.all_crowns else "no teeth were found in it"),
@@ -132,7 +133,8 @@ def _crown(crown: Crown) -> Content:
         "jaw": crown.jaw,
         "outline": np.round(crown.outline, 1).tolist(),
         "number": crown.number,
-        "doubt": round(float(crown.doubt), 3),
+        # 0 where a person has said the number, and only there.
+        "doubt": max(round(float(crown.doubt), 3), 0.001) if crown.doubt else 0.0,
         "weak": bool(crown.doubtful),
         "offered": [[tooth, round(float(share), 3)] for tooth, share in offered],
     }
@@ -150,7 +152,8 @@ def _entries(photo: PhotoCorrection) -> Content:
         else:
             entry["remove"] = True
         crowns.append(entry)
-    return {"use": photo.use, "kind": photo.kind, "crowns": crowns}
+    said = {"use": photo.use, "kind": photo.kind, "mirrored": photo.mirrored}
+    return said | {"crowns": crowns}
 
 
 def command(case: Case) -> list[str]:

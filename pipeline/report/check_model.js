@@ -22,6 +22,10 @@ const numberAt = (jaw, stand, primary) => {
   const quadrant = jaw === "upper" ? (stand < 0 ? 1 : 2) : (stand < 0 ? 4 : 3);
   return (quadrant + (primary ? 4 : 0)) * 10 + Math.abs(stand);
 };
+const otherSide = (tooth) => {
+  const quadrant = Math.floor(tooth / 10);
+  return 10 * (quadrant % 2 ? quadrant + 1 : quadrant - 1) + tooth % 10;
+};
 const nameOf = (tooth) => {
   const primary = isPrimary(tooth);
   const side = standing(tooth) < 0 ? "right" : "left";
@@ -149,7 +153,14 @@ const problemsOf = (photo) => {
 const quoted = (text) => JSON.stringify(text).replace(/[\u007f-\u009f\u2028\u2029\ufeff]/g,
   (letter) => `\\u${letter.charCodeAt(0).toString(16).padStart(4, "0")}`);
 const place = (point) => `[${point.map((value) => Math.round(value * 10) / 10).join(", ")}]`;
-const original = (photo, point) => point.map((value, axis) => value * photo.scale[axis]);
+// Pixels of the picture as shown, which may be turned over, and of the photograph as it was taken.
+const turnedOver = (photo, [x, y]) => [photo.mirrored ? photo.width - x : x, y];
+const original = (photo, point) =>
+  turnedOver(photo, point).map((value, axis) => value * photo.scale[axis]);
+const shownAt = (photo, at) => turnedOver(photo, at.map((value, axis) => value / photo.scale[axis]));
+// What is said of a picture shown turned over is said of a mirror image.
+const mirroredOf = (photo) => photo.mirroredSaid ?? (photo.mirrored
+  && (photo.kindSaid !== null || photo.entries.some((entry) => entry.tooth)) ? true : null);
 const entryLine = (entry) => {
   const what = entry.tooth ? `tooth: ${entry.tooth}`
     : entry.split ? `split: [${entry.split.map(place).join(", ")}]` : "remove: true";
@@ -158,12 +169,14 @@ const entryLine = (entry) => {
 const yamlOf = (photos) => {
   const lines = ["# Written by check.html of dentalsplat. Places are pixels of the photograph, upright."];
   for (const photo of photos) {
-    const said = photo.use !== null || photo.kindSaid !== null || photo.entries.length;
+    const said = [photo.use, photo.kindSaid, photo.mirroredSaid].some((value) => value !== null)
+      || photo.entries.length;
     if (!said) continue;
     if (lines.length === 1) lines.push("photographs:");
     lines.push(`  ${quoted(photo.name)}:`);
     if (photo.use !== null) lines.push(`    use: ${photo.use}`);
     if (photo.kindSaid !== null) lines.push(`    kind: ${photo.kindSaid}`);
+    if (mirroredOf(photo) !== null) lines.push(`    mirrored: ${mirroredOf(photo)}`);
     if (photo.entries.length) lines.push("    crowns:", ...photo.entries.map(entryLine));
   }
   return `${lines.join("\n")}\n`;

@@ -18,9 +18,10 @@ const cardOf = (photo) => {
   if (cards.has(photo)) return cards.get(photo);
   const { whole, near, worth } = pictureOf(photo);
   const card = { crowns: make("g"), rows: make("div", { class: "rows" }),
-    notes: make("div", { class: "notes" }) };
+    notes: make("div", { class: "notes" }), mirrored: photo.mirrored };
   card.svg = make("svg", { viewBox: (worth ? near : whole).join(" "), "aria-hidden": "true" },
-    make("image", { href: photo.picture, width: photo.width, height: photo.height }), card.crowns);
+    card.image = make("image", { href: photo.picture, width: photo.width, height: photo.height }),
+    card.crowns);
   const point = (event) => {
     const at = new DOMPoint(event.clientX, event.clientY)
       .matrixTransform(card.svg.getScreenCTM().inverse());
@@ -58,7 +59,7 @@ const cardOf = (photo) => {
     photo.kind)]), ...kinds.map(([kind, name]) => make("option", { value: kind }, name)));
   const zoom = make("button", { type: "button", class: "plain", onclick: () => {
     const wide = card.svg.getAttribute("viewBox") !== whole.join(" ");
-    card.svg.setAttribute("viewBox", (wide ? whole : near).join(" "));
+    card.svg.setAttribute("viewBox", (wide ? whole : pictureOf(photo).near).join(" "));
     zoom.textContent = wide ? "Teeth only" : "Whole photograph";
   } }, "Whole photograph");
   card.root = make("article", { "aria-label": photo.name },
@@ -66,6 +67,8 @@ const cardOf = (photo) => {
       make("label", {}, "shows the teeth ", card.kind),
       card.sure = make("button", { type: "button", onclick: () => confirm(photo),
         title: "Take every number in this photograph as certain" }, "All numbers are right"),
+      card.over = make("button", { type: "button", onclick: () => turnOver(photo),
+        title: "Take it as a mirror image, or as none" }, "Mirror image"),
       make("button", { type: "button", onclick: () => useIt(photo, false) }, "Leave out")),
     make("div", { class: "picture" }, card.svg), card.notes, card.rows);
   cards.set(photo, card);
@@ -113,8 +116,16 @@ const drawCard = (photo) => {
   card.sure.disabled = problems.length > 0
     || !photo.crowns.some((crown) => crown.number && crown.doubt);
   card.kind.value = kindOf(photo) in KIND_NAMES ? kindOf(photo) : "";
+  card.image.setAttribute("transform", photo.mirrored ? `translate(${photo.width} 0) scale(-1 1)` : "");
+  if (card.mirrored !== photo.mirrored) {
+    const [x, y, wide, high] = card.svg.getAttribute("viewBox").split(" ").map(Number);
+    card.svg.setAttribute("viewBox", [photo.width - x - wide, y, wide, high].join(" "));
+    card.mirrored = photo.mirrored;
+  }
+  card.over.setAttribute("aria-pressed", String(photo.mirrored));
   drawCrowns(photo, card);
   card.notes.replaceChildren(
+    ...(photo.mirrored ? [make("p", {}, "A mirror image: shown turned over.")] : []),
     ...problems.map((problem) => make("p", { class: "wrong" }, `Can't be: ${problem.text}.`)),
     ...photo.doubts.map((text) => make("p", { class: "doubt" }, sentence(text))));
   const first = photo.crowns.some((crown) => crown.id === chosen?.id) ? null

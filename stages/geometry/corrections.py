@@ -13,7 +13,7 @@ from pipeline.artifacts.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
-from stages.geometry.crowns import dentition_of, outline_of
+from stages.geometry.crowns import dentition_of, mirrored_dentition, outline_of
 
 Array = npt.NDArray[np.float64]
 
@@ -36,7 +36,7 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
 
     Returns:
         The teeth without pictures, for those would show what was; unchanged where there is nothing
-        to correct.
+        to correct. Those of mirror images are of the pictures turned over.
 
     Raises:
         RequestError: a photograph or a crown that isn't there; the message names it.
@@ -83,6 +83,9 @@ def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, Pho
 
 
 def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: str) -> Dentition:
+    mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
+    if dentition.mirrored:  # places are pixels of the photograph as it was taken
+        dentition = mirrored_dentition(dentition)
     crowns = list(dentition.all_crowns)
     moved = False
     for k, change in enumerate(photo.crowns):
@@ -99,15 +102,20 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
             f"{where}: use is true, but no tooth was found in this photograph. Leave it out."
         )
     if moved:
-        return dentition_of(
+        corrected = dentition_of(
             [outline_of(crown) for crown in crowns], dentition.name, dentition.size, kind,
             roll=dentition.roll, set_aside=set_aside, doubts=dentition.doubts,
         )  # fmt: skip
-    return replace(
-        dentition, kind=kind, set_aside=set_aside,
-        upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
-        lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
-    )  # fmt: skip
+    else:
+        corrected = replace(
+            dentition, kind=kind, set_aside=set_aside,
+            upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
+            lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
+        )  # fmt: skip
+    if not mirrored:
+        return replace(corrected, mirrored=mirrored)
+    turned = mirrored_dentition(corrected)
+    return replace(turned, kind=photo.kind or turned.kind)
 
 
 def _change(

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.fdi import JAWS, Jaw, other_side
 from pipeline.artifacts.teeth import Crown, Dentition
 
 Array = npt.NDArray[np.float64]
@@ -97,6 +97,45 @@ def dentition_of(
         roll=turn,
         band_height=band,
         jaws_apart=_jaws_apart(upright, rows, band),
+    )
+
+
+def mirrored_dentition(dentition: Dentition) -> Dentition:
+    """The teeth in the picture turned over: those of a mirror image as they are.
+
+    Numbers that a person has said (doubt 0) are the patient's, whatever the picture shows.
+    """
+    width = dentition.size[0]
+    return replace(
+        dentition,
+        kind={"right": "left", "left": "right"}.get(dentition.kind, dentition.kind),
+        upper=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.upper)),
+        lower=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.lower)),
+        roll=-dentition.roll,
+        mirrored=True,
+    )
+
+
+def _mirrored_crown(crown: Crown, width: int) -> Crown:
+    def over(point: Array | None) -> Array | None:
+        return None if point is None else np.array([width - point[0], point[1]])
+
+    zenith, tip = over(crown.zenith), over(crown.tip)
+    assert zenith is not None and tip is not None
+    guessed = crown.number and crown.doubt > 0
+    return replace(
+        crown,
+        zenith=zenith,
+        tip=tip,
+        papilla_left=over(crown.papilla_right),
+        papilla_right=over(crown.papilla_left),
+        embrasure_left=over(crown.embrasure_right),
+        embrasure_right=over(crown.embrasure_left),
+        cut_left=crown.cut_right,
+        cut_right=crown.cut_left,
+        outline=(np.array([width, 0.0]) + crown.outline * [-1.0, 1.0])[::-1],
+        numbers={other_side(tooth): share for tooth, share in crown.numbers.items()},
+        number=other_side(crown.number) if guessed else crown.number,
     )
 
 

@@ -12,7 +12,7 @@ from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import Views
-from pipeline.errors import ReconstructionError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
 from stages.geometry.crowns import dentition_of, outline_of
 from stages.geometry.known_cameras import KnownCamera, as_pinhole
@@ -98,6 +98,12 @@ def from_known_teeth(
     names = [photo_name(view) for view in placed]
     arch = arch_options(config.dental, replace(views, views=tuple(placed)))
     by_name = labelled_teeth(context, views).by_name()
+    if turned := [photo_name(view) for view, _ in pairs if _mirrored(by_name.get(view.name))]:
+        raise RequestError(
+            f"{', '.join(turned)} {'is' if len(turned) == 1 else 'are'} said to be mirrored, but "
+            "init.cameras gives a camera for the picture as it is. Take `mirrored` out of the "
+            "corrections, or leave init.cameras out."
+        )
     chosen = [
         moved(by_name[view.name], found)
         if view.name in by_name and by_name[view.name].all_crowns
@@ -129,6 +135,10 @@ def from_known_teeth(
         views=tuple(placed), cameras=tuple(cameras), points=np.zeros((0, 3)), seen=(), weights={},
         units=units,
     ))  # fmt: skip
+
+
+def _mirrored(dentition: Dentition | None) -> bool:
+    return bool(dentition and dentition.mirrored)
 
 
 def moved(dentition: Dentition, centred: CentredView) -> Dentition:

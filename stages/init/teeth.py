@@ -48,6 +48,9 @@ def from_teeth(context: StageContext, views: Views) -> None:
     """
     config: InitConfig = context.config
     read = labelled_teeth(context, views)
+    said = {dentition.name for dentition in read.views if dentition.mirrored}
+    given = views
+    views = replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
     dentitions = chosen_dentitions(read, views)
     if config.dental.order is not None:
         dentitions = [d or e for d, e in zip(dentitions, read.views, strict=True)]
@@ -64,10 +67,10 @@ def from_teeth(context: StageContext, views: Views) -> None:
         if isinstance(numbered, TeethArtifact):
             doubtful.artifacts["teeth"] = updated(read, numbered.views)
         raise
-    for doubt in (*teeth.fit.doubts, *misnamed(names, teeth)):
+    for doubt in (*teeth.fit.doubts, *turned_back(names, teeth), *misnamed(names, teeth)):
         context.warn(doubt)
     context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
-    _write(context, views, teeth)
+    _write(context, given, teeth)
 
 
 def labelled_teeth(context: StageContext, views: Views) -> TeethArtifact:
@@ -108,6 +111,15 @@ def updated(read: TeethArtifact, numbered: Iterable[Dentition]) -> TeethArtifact
     return replace(read, views=tuple(new.get(view.name, view) for view in read.views), pictures={})
 
 
+def turned_back(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of photographs that were mirror images."""
+    return [
+        f"{names[k]} is a mirror image: the patient's right is on its left where the other "
+        "photographs have it on theirs. It was turned over."
+        for k in teeth.mirrored
+    ]
+
+
 def misnamed(names: list[str], teeth: Reconstruction) -> list[str]:
     """What to say of photographs whose names call them the other side than their teeth show."""
     other = {"right": "left", "left": "right"}
@@ -129,8 +141,8 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     mm, uncertainty = scale_from_widths(teeth.fit, config.dental.tooth_widths)
     mask = config.dental.mask_rest is not False
     placement = Placement(
-        views=tuple(_masked(views.views[k], teeth, k, mask) for k in order),
-        cameras=tuple(_camera(views.views[k], teeth, k) for k in order),
+        views=tuple(_masked(teeth.views[k], teeth, k, mask) for k in order),
+        cameras=tuple(_camera(teeth.views[k], teeth, k) for k in order),
         points=surface.positions.astype(np.float64), seen=(), weights={},
         input_from_world=np.diag([mm, mm, mm, 1.0]), units="mm",
     ).normalised()  # fmt: skip

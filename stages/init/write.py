@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
@@ -110,7 +110,7 @@ def save_all(
     changed = {view.name: view for view in placed if _differs(view, before[view.name])}
     if changed:
         context.save(replace(views, views=tuple(changed.get(v.name, v) for v in views.views)))
-    bent = sum(view.image is not before[view.name].image for view in placed)
+    bent = sum(view.lens_taken_out != before[view.name].lens_taken_out for view in placed)
     if bent:
         context.summarize(undistorted=bent)
     focals = [camera.fx / max(camera.width, camera.height) for camera in cameras.cameras]
@@ -123,6 +123,11 @@ def save_all(
 def _differs(view: View, before: View) -> bool:
     same = view.image is before.image and view.mask is before.mask
     return not same or view.focal_px != before.focal_px
+
+
+def _turned_over(view: View, before: View) -> bool:
+    sides = [np.linalg.det(v.working_from_source[:2, :2]) > 0 for v in (view, before)]
+    return bool(sides[0] != sides[1])
 
 
 def _scaled(
@@ -139,8 +144,11 @@ def _scaled(
             f"init.length.photo: {length.photo} could not be placed, so that nothing can be "
             "measured in it. Name another photograph."
         )
-    camera: Camera = cameras.cameras[number]
-    factor = mm_per_unit(view, camera, depths[number], length.start, length.end, length.mm)
+    camera, depth = cameras.cameras[number], depths[number]
+    if _turned_over(placed[number], view):  # start and end are in the photograph as it was taken
+        camera = replace(camera, cx=camera.width - camera.cx)
+        depth = np.ascontiguousarray(depth[:, ::-1])
+    factor = mm_per_unit(view, camera, depth, length.start, length.end, length.mm)
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
     input_from_world = np.diag([factor / scale] * 3 + [1.0]) @ cameras.input_from_world
     context.summarize(mm_per_unit=round(factor, 4))

@@ -186,3 +186,31 @@ def test_cameras_with_distortion_are_refused(tmp_path: Path) -> None:
     model.write_text(str(tmp_path))
     with pytest.raises(ValueError, match="undistort"):
         read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("lying", [False, True])
+def test_a_view_turned_over_shows_the_same_places_on_the_other_side(lying: bool) -> None:
+    rng = np.random.default_rng(0)
+    image, mask = rng.uniform(size=(6, 9, 3)).astype(np.float32), rng.uniform(size=(6, 9)) > 0.5
+    upright = np.array([[0.0, -0.5, 9.0], [0.5, 0, 0], [0, 0, 1]])  # a quarter turn, half the size
+    view = View(
+        "000", image, mask, upright if lying else np.diag([0.5, 0.5, 1.0]),
+        (12, 18) if lying else (18, 12), "a.jpg", focal_px=31.5,
+    )  # fmt: skip
+    over = view.mirrored()
+    assert (over.name, over.source_name, over.focal_px) == ("000", "a.jpg", 31.5)
+    assert (over.width, over.height, over.upright_size) == (9, 6, view.upright_size)
+    assert over.image.flags.c_contiguous
+    assert over.mask is not None
+    source_from_working = np.linalg.inv(view.working_from_source)
+    for row, column in np.ndindex(6, 9):
+        source = source_from_working @ [column + 0.5, row + 0.5, 1]
+        x, y, _ = over.working_from_source @ source - 0.5
+        there = round(float(y)), round(float(x))
+        np.testing.assert_allclose([y, x], there, atol=1e-9)
+        np.testing.assert_array_equal(over.image[there], image[row, column])
+        assert over.mask[there] == mask[row, column]
+    again = over.mirrored()
+    np.testing.assert_array_equal(again.image, image)
+    np.testing.assert_allclose(again.working_from_source, view.working_from_source)
+    assert dataclasses.replace(view, mask=None).mirrored().mask is None

@@ -31,11 +31,12 @@ photographs:
   0_right.jpg:
     use: true
     kind: right
+    mirrored: true
     crowns:
       - {at: [412, 300.5], tooth: 16}
       - {at: [1, 2], remove: true}
       - {at: [3, 4], split: [[1, 2], [3, 4.5]]}
-  "001": {use: false}
+  "001": {use: false, mirrored: false}
   1.jpg:
 """
 
@@ -48,14 +49,23 @@ def test_what_the_page_writes_is_read(tmp_path: Path) -> None:
         CrownCorrection((3, 4), split=((1, 2), (3, 4.5))),
     )
     assert found.photographs == {
-        "0_right.jpg": PhotoCorrection(True, "right", crowns),
-        "001": PhotoCorrection(use=False),
+        "0_right.jpg": PhotoCorrection(True, "right", True, crowns),
+        "001": PhotoCorrection(use=False, mirrored=False),
         "1.jpg": PhotoCorrection(),
     }
     assert found
 
 
-@pytest.mark.parametrize("text", ["", "# nothing\n", "photographs:\n", "photographs: {a.jpg: {}}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "# nothing\n",
+        "photographs:\n",
+        "photographs: {a.jpg: {}}",
+        "photographs: {a.jpg: {mirrored: }}",
+    ],
+)
 def test_an_empty_file_changes_nothing(tmp_path: Path, text: str) -> None:
     found = read_corrections(case.write(tmp_path / "teeth.yaml", text))
     assert not found
@@ -76,6 +86,10 @@ def one(entry: str) -> str:
         ("photographs: {a.jpg: {used: true}}", r"photograph 'a.jpg': 'used' .*Did you mean 'use'"),
         ("photographs: {a.jpg: {use: 1}}", "use must be true or false, not 1"),
         ("photographs: {a.jpg: {use: yes}}", "use must be true or false, not 'yes'"),
+        ("photographs: {a.jpg: {mirrored: 1}}", "mirrored must be true or false, not 1"),
+        ("photographs: {a.jpg: {mirrored: yes}}", "mirrored must be true or false, not 'yes'"),
+        ("photographs: {a.jpg: {mirrored: [true]}}", "mirrored must be true or false"),
+        ("photographs: {a.jpg: {mirored: true}}", "'mirored' .*Did you mean 'mirrored'"),
         ("photographs: {a.jpg: {kind: rigth}}", "kind must be.*Did you mean 'right'"),
         ("photographs: {a.jpg: {crowns: {at: 1}}}", "crowns must be a list"),
         (one("{tooth: 11}"), r"crowns\[0\] must say where the crown is"),
@@ -246,6 +260,63 @@ def test_photographs_are_left_out_used_and_called_otherwise() -> None:
     empty = Teeth((Dentition("000", (300, 200), "none"), *teeth.views[1:]))
     with pytest.raises(RequestError, match="no tooth was found in this photograph"):
         applied(empty, v000=PhotoCorrection(use=True))
+
+
+#: From left to right in a photograph of the patient's right side as it was taken.
+TAKEN = (16, 15, 14, 13, 12, 11)
+
+
+def side_view() -> Teeth:
+    first = case.dentition("000", "right", TAKEN, ())
+    return Teeth((first, *case.teeth().views[1:]))
+
+
+def test_a_mirror_image_is_turned_over_after_its_crowns_were_put_right() -> None:
+    x, y = case.original(1, "upper")
+    photo = PhotoCorrection(mirrored=True, crowns=(
+        CrownCorrection(case.original(0, "upper"), tooth=27),
+        CrownCorrection((x, y), split=((x, y - 90), (x, y + 90))),
+        CrownCorrection((x - 20, y), tooth=65),
+        CrownCorrection(case.original(3, "upper"), remove=True),
+    ))  # fmt: skip
+    after = applied(side_view(), v000=photo)
+    view = after[0]
+    assert (view.kind, view.mirrored, view.name) == ("left", True, "000")
+    # What a person has said is the patient's number; what was read in the mirror is the other's.
+    assert numbers(view) == [21, 22, 24, 0, 65, 27]
+    assert [crown.doubt for crown in view.upper] == [0.05, 0.05, 0.05, 1, 0, 0]
+    assert view.upper[-1].centre[0] == pytest.approx(case.WIDTH - case.middle(0, "upper")[0])
+    assert view.upper[0].centre[0] == pytest.approx(case.WIDTH - case.middle(5, "upper")[0])
+    assert view.upper[2].papilla_left is None, "its neighbour was removed"
+    assert [other.mirrored for other in after[1:]] == [None, None]
+
+
+def test_the_side_that_a_mirror_image_shows_may_be_said_too() -> None:
+    said = PhotoCorrection(kind="right", mirrored=True)
+    assert applied(side_view(), v000=said)[0].kind == "right"
+    front = PhotoCorrection(kind="front", mirrored=True, crowns=(
+        CrownCorrection(case.original(0, "upper"), remove=True),
+    ))  # fmt: skip
+    assert applied(side_view(), v000=front)[0].kind == "front"
+
+
+def test_a_photograph_that_is_no_mirror_image_stays_as_it_is() -> None:
+    before = side_view().views[0]
+    after = applied(side_view(), v000=PhotoCorrection(mirrored=False))[0]
+    assert (after.mirrored, after.kind, numbers(after)) == (False, "right", list(TAKEN))
+    assert np.array_equal(after.upper[0].outline, before.upper[0].outline)
+
+
+def test_what_is_said_later_is_of_the_photograph_as_it_was_taken() -> None:
+    """Settings add numbers to those of a file that has turned the photograph over."""
+    once = Teeth(applied(side_view(), v000=PhotoCorrection(mirrored=True)))
+    number = PhotoCorrection(crowns=(CrownCorrection(case.original(0, "upper"), tooth=27),))
+    after = applied(once, v000=number)[0]
+    assert (after.mirrored, after.kind) == (True, "left")
+    assert numbers(after) == [21, 22, 23, 24, 25, 27]
+    assert after.upper[-1].centre[0] == pytest.approx(case.WIDTH - case.middle(0, "upper")[0])
+    back = applied(Teeth((after, *once.views[1:])), v000=PhotoCorrection(mirrored=False))[0]
+    assert (back.mirrored, back.kind, numbers(back)) == (False, "right", [27, *TAKEN[1:]])
 
 
 def test_unknown_and_doubled_photographs_are_refused() -> None:

@@ -17,6 +17,7 @@ from pipeline.artifacts.fdi import (
     is_left,
     is_primary,
     is_upper,
+    other_side,
     permanent_of,
     primary_of,
     teeth_of,
@@ -64,6 +65,18 @@ def test_primary_and_permanent_lead_to_each_other() -> None:
         assert is_left(tooth) == is_left(permanent_of(tooth)) == (tooth // 10 in (2, 3, 6, 7))
 
 
+def test_the_other_side_has_the_same_teeth() -> None:
+    pairs = {11: 21, 17: 27, 38: 48, 41: 31, 51: 61, 75: 85}
+    for tooth, other in pairs.items():
+        assert (other_side(tooth), other_side(other)) == (other, tooth)
+    for tooth in ALL_TEETH:
+        other = other_side(tooth)
+        assert other_side(other) == tooth
+        assert is_left(other) != is_left(tooth)
+        assert is_upper(other) == is_upper(tooth)
+        assert (other % 10, is_primary(other)) == (tooth % 10, is_primary(tooth))
+
+
 def test_rows_go_from_the_patients_right_to_the_left() -> None:
     for jaw in JAWS:
         row = teeth_of(jaw)
@@ -99,13 +112,15 @@ def dentition() -> Dentition:
     lower = (crown(box(22, 40, 20, 25), "lower", cut_right=True, numbers={85: 1.0}),)
     return Dentition(
         "000", (WIDTH, HEIGHT), "front", upper, lower, np.radians(12.5), 55.25, 0.125,
-        doubts=("it looks mirrored",),
+        doubts=("it looks mirrored",), mirrored=True,
     )  # fmt: skip
 
 
 def teeth() -> Teeth:
     picture = np.random.default_rng(0).integers(0, 255, (8, 9, 3)).astype(np.uint8)
-    aside = Dentition("001", (50, 40), "upper", set_aside="it shows one jaw only")
+    aside = Dentition(
+        "001", (50, 40), "upper", set_aside="it shows one jaw only", mirrored=False
+    )  # fmt: skip
     return Teeth((dentition(), aside), {"000": picture})
 
 
@@ -133,6 +148,7 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert list(back.pictures) == ["000"]
     np.testing.assert_array_equal(back.pictures["000"], teeth().pictures["000"])
     assert back.by_name()["001"].set_aside
+    assert [view.mirrored for view in back.views] == [True, False]
     assert [view.name for view in back.chosen] == ["000"]
 
 
@@ -154,6 +170,16 @@ def test_the_file_says_both_numbers_and_holds_no_folder(tmp_path: Path) -> None:
     assert first["crowns"][0]["numbers"] == {"11": 0.75, "12": 0.25}
     assert first["roll_degrees"] == 12.5
     assert second["crowns"] == []
+
+
+def test_teeth_of_which_nobody_said_whether_they_are_mirrored(tmp_path: Path) -> None:
+    Teeth((replace(dentition(), mirrored=None),)).save(tmp_path)
+    assert Teeth.load(tmp_path).views[0].mirrored is None
+    file = tmp_path / "teeth.json"
+    before = json.loads(file.read_text())
+    del before["views"][0]["mirrored"]  # as files had it when nobody could say so
+    file.write_text(json.dumps(before))
+    assert Teeth.load(tmp_path).views[0].mirrored is None
 
 
 def test_nothing_is_a_dentition_too(tmp_path: Path) -> None:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.views import View, Views
-from pipeline.errors import ReconstructionError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init import known_teeth
 from stages.init.config import InitConfig
 from stages.init.stage import InitStage
 from tests.stages.test_init_teeth import FOCAL, SIZE, found_teeth, read_teeth, side_pose
+from tests.teeth_case import write
 
 UNIT = 0.02  # of the cameras' world per mm of the arch
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -152,6 +153,25 @@ def test_the_sweep_is_taken_for_near_views_other_things_and_by_name(
     with pytest.raises(ReconstructionError, match="the sweep was asked"):
         InitStage().run(context)
     assert not asked
+
+
+def test_a_known_camera_is_of_the_picture_as_it_is(tmp_path, monkeypatch):
+    def said(text):
+        labels = str(write(tmp_path / "said.yaml", text))
+        return run(
+            tmp_path, monkeypatch, transforms(tmp_path), found_teeth(), dental={"labels": labels}
+        )
+
+    context, asked = said("photographs: {1.png: {mirrored: true}}")
+    with pytest.raises(RequestError, match=r"^1\.png is said to be mirrored, but init.cameras"):
+        InitStage().run(context)
+    assert not asked
+    context, _ = said("photographs: {0.png: {mirrored: true}, 2.png: {mirrored: true}}")
+    with pytest.raises(RequestError, match=r"^0\.png, 2\.png are said to be mirrored"):
+        InitStage().run(context)
+    context, asked = said("photographs: {1.png: {mirrored: false}}")
+    InitStage().run(context)
+    assert len(asked["dentitions"]) == 3
 
 
 def test_a_photograph_without_teeth_is_named(tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, SurfaceView
 from stages.init.stage import InitStage
+from tests.teeth_case import write
 
 SIZE = (96, 128)
 FOCAL = 240.0
@@ -108,30 +109,45 @@ def found_teeth(yaws=(-40, 0, 40), widths=()):
         with_numbers(dentition, view, fit)
         for dentition, view in zip(read_teeth(len(yaws)).views, views, strict=True)
     ]
-    return Reconstruction(numbered, fit, surface, {"teeth": picture, "turned": picture})
+    return Reconstruction(
+        list(photographs(len(yaws)).views), numbered, fit, surface,
+        pictures={"teeth": picture, "turned": picture},
+    )  # fmt: skip
 
 
 def photographs(count=3):
-    image = np.full((*SIZE, 3), 0.5, np.float32)
+    """Brighter to the right."""
+    ramp = np.linspace(0.2, 0.8, SIZE[1], dtype=np.float32)
+    image = np.broadcast_to(ramp[:, None], (*SIZE, 3))
     return Views(
         tuple(View(f"{k:03d}", image.copy(), source_name=f"p{k}.jpg") for k in range(count))
     )
 
 
-def run(tmp_path, monkeypatch, found, read=None, asked=None, **dental):
-    """The stage with the reconstruction as given (an exception is raised); what it was asked."""
+def run(
+    tmp_path, monkeypatch, found, read=None, asked=None, said=None, length=None, over=(), **dental
+):
+    """The stage with the reconstruction as given (an exception is raised); what it was asked.
+
+    Args:
+        said: text of `teeth.yaml`.
+        over: photographs that the reconstruction turns over.
+    """
 
     def reconstruct(views, names, dentitions, *args, **kwargs):
         if asked is not None:
             asked.extend(dentitions)
         if isinstance(found, Exception):
             raise found
-        return found
+        shown = [view.mirrored() if k in over else view for k, view in enumerate(views)]
+        return replace(found, views=shown, mirrored=tuple(over))
 
     monkeypatch.setattr(teeth, "reconstruct_teeth", reconstruct)
-    config = InitConfig(method="dental", dental=dental)
+    config = InitConfig(method="dental", dental=dental, length=length or {})
     inputs = {"views": photographs(), "teeth": read or read_teeth()}
-    context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
+    tmp_path.mkdir(exist_ok=True)
+    sources = {"teeth.yaml": write(tmp_path / "teeth.yaml", said)} if said else {}
+    context = LocalContext(config, tmp_path, inputs=inputs, sources=sources, threads=1)
     InitStage().run(context)
     return context
 
@@ -259,6 +275,59 @@ def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path
         said(x=5, y=5)
     with pytest.raises(RequestError, match="no photograph 'q0'"):
         said(photo="q0")
+
+
+def test_a_photograph_said_to_be_mirrored_is_turned_over_with_its_teeth(tmp_path, monkeypatch):
+    asked = []
+    said = """
+        photographs:
+          p1.jpg: {mirrored: true, crowns: [{at: [35, 30], tooth: 22}]}
+          p2.jpg: {mirrored: false}
+    """
+    read = read_teeth(numbers=(12, 11, 13))
+    context = run(tmp_path, monkeypatch, found_teeth(), read, asked, said)
+    assert [dentition.mirrored for dentition in asked] == [None, True, False]
+    assert [crown.number for crown in asked[0].upper] == [12, 11, 13]
+    assert [crown.number for crown in asked[1].upper] == [23, 21, 22]
+    left = [crown.outline[:, 0].min() for crown in asked[1].upper]
+    assert left == [SIZE[1] - 89, SIZE[1] - 69, SIZE[1] - 49]
+    for k, view in enumerate(context.result("views").views):
+        before = photographs().views[k].image
+        np.testing.assert_allclose(
+            view.image, before[:, ::-1] if k == 1 else before, atol=0.5 / 255
+        )
+        assert (np.linalg.det(view.working_from_source) < 0) == (k == 1)
+    assert not any("turned over" in warning for warning in context.warnings)
+    assert "undistorted" not in context.figures
+
+
+def test_a_photograph_that_was_turned_over_is_named(tmp_path, monkeypatch):
+    context = run(tmp_path, monkeypatch, found_teeth(), over=(2,))
+    (warning,) = [text for text in context.warnings if "turned over" in text]
+    assert warning.startswith("p2.jpg is a mirror image")
+    before = photographs().views[2].image
+    image = context.result("views").views[2].image
+    np.testing.assert_allclose(image, before[:, ::-1], atol=0.5 / 255)
+
+
+def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):
+    """Where one end is nearer than the other it matters which side is which."""
+    length = {"mm": 5.0, "photo": "p1", "start": [20, 40], "end": [60, 40]}
+    ramp = np.broadcast_to(np.linspace(90, 150, SIZE[1], dtype=np.float32), SIZE)
+
+    def millimetres(name, depth, **more):
+        found = found_teeth()
+        views = list(found.surface.views)
+        views[1] = replace(views[1], depth=depth)
+        found = replace(found, surface=replace(found.surface, views=tuple(views)))
+        context = run(tmp_path / name, monkeypatch, found, length=length, **more)
+        return context.figures["mm_per_unit"]
+
+    taken = millimetres("taken", ramp)
+    said = "photographs: {p1.jpg: {mirrored: true}}"
+    assert millimetres("over", ramp[:, ::-1], over=(1,)) == pytest.approx(taken)
+    assert millimetres("said", ramp[:, ::-1], said=said) == pytest.approx(taken)
+    assert millimetres("other", ramp[:, ::-1]) != pytest.approx(taken, rel=0.05)
 
 
 def test_settings_reach_the_fit():

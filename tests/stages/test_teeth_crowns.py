@@ -16,6 +16,7 @@ from stages.geometry.crowns import (
     Outline,
     centroid,
     dentition_of,
+    mirrored_dentition,
     outline_of,
 )
 
@@ -217,6 +218,67 @@ def test_outlines_lead_to_the_same_dentition_again() -> None:
     assert as_text(first) == as_text(again)
     crown = first.upper[0]
     assert (crown.score, crown.numbers, crown.number, crown.doubt) == (0.9, {11: 1.0}, 1, 0.3)
+
+
+def numbered(outlines: list[Outline]) -> list[Outline]:
+    """With numbers that are those of teeth; the third of each row was said by a person."""
+    count = {"upper": len(UPPER_WIDTHS), "lower": len(LOWER_WIDTHS)}
+    first = {"upper": [14, 13, 12, 11, 21, 22, 63], "lower": [44, 43, 42, 41, 31, 32]}
+    result = []
+    for jaw in ("upper", "lower"):
+        row = [outline for outline in outlines if outline.jaw == jaw]
+        assert len(row) == count[jaw]
+        for k, (outline, number) in enumerate(zip(row, first[jaw], strict=True)):
+            shares = {number: 0.75, 24: 0.25}
+            result.append(
+                replace(outline, number=number, numbers=shares, doubt=0.0 if k == 2 else 0.3)
+            )
+    return result
+
+
+@pytest.mark.parametrize("degrees", [0.0, -17.0, 40.0, 180.0])
+def test_teeth_of_a_mirror_image(degrees: float) -> None:
+    """As they would have been read from the picture turned over."""
+    outlines = numbered(mouth(degrees, bump=0.4, gaps={3: 20.0}))
+    found = read(outlines, set_aside="why", doubts=("odd",))
+    over = mirrored_dentition(found)
+    turned_over = [replace(o, polygon=o.polygon * [-1, 1] + [SIZE[0], 0]) for o in outlines]
+    expected = read(turned_over)
+    assert np.sin(over.roll - expected.roll) == pytest.approx(0, abs=1e-9)
+    assert (over.band_height, over.jaws_apart) == (found.band_height, found.jaws_apart)
+    assert (over.set_aside, over.doubts, over.mirrored) == ("why", ("odd",), True)
+    assert [crown.number for crown in over.upper] == [53, 12, 11, 21, 12, 23, 24]
+    assert [crown.number for crown in over.lower] == [42, 41, 31, 42, 33, 34]
+    assert [crown.doubt for crown in over.upper] == [0.3, 0.3, 0.3, 0.3, 0, 0.3, 0.3]
+    assert over.upper[-1].numbers == {24: 0.75, 14: 0.25}
+    for crown, wanted in zip(over.all_crowns, expected.all_crowns, strict=True):
+        np.testing.assert_allclose(crown.outline, wanted.outline[::-1])
+        for name, value in vars(wanted).items():
+            if isinstance(value, np.ndarray) and name != "outline":
+                assert np.linalg.norm(getattr(crown, name) - value) < NEAR
+            elif name not in ("outline", "number", "numbers", "width", "height"):
+                assert getattr(crown, name) == value, name
+    again = mirrored_dentition(over)
+    assert again.roll == found.roll
+    for crown, wanted in zip(again.all_crowns, found.all_crowns, strict=True):
+        for name, value in vars(wanted).items():
+            if isinstance(value, np.ndarray):
+                np.testing.assert_allclose(getattr(crown, name), value)
+            else:
+                assert getattr(crown, name) == value, name
+
+
+def test_sides_change_and_crowns_without_outline_stay_in_a_mirror_image() -> None:
+    found = replace(read(mouth()), kind="right")
+    assert mirrored_dentition(found).kind == "left"
+    assert mirrored_dentition(replace(found, kind="left")).kind == "right"
+    assert mirrored_dentition(replace(found, kind="front")).kind == "front"
+    bare = tuple(replace(crown, outline=np.zeros((0, 2)), number=0) for crown in found.upper)
+    over = mirrored_dentition(replace(found, upper=bare))
+    assert [crown.number for crown in over.upper] == [0] * len(bare)
+    assert over.upper[0].zenith[0] == SIZE[0] - bare[-1].zenith[0]
+    empty = mirrored_dentition(Dentition("a", SIZE, "none"))
+    assert (empty.all_crowns, empty.mirrored) == ((), True)
 
 
 def as_text(dentition: Dentition) -> str:

@@ -19,6 +19,7 @@ from stages.init.dental.pictures.turned import turned_sheet
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.turned import Turned, fit_turned
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -38,15 +39,19 @@ class Reconstruction:
     """What `reconstruct_teeth` found.
 
     Attributes:
-        dentitions: the teeth in each photograph with their numbers; None where none are used.
+        views: the photographs, mirror images among them turned back.
+        dentitions: the teeth in each with their numbers; None where none are used.
         fit: cameras and named landmarks.
         surface: dense depth of each placed view, and one cloud.
+        mirrored: which photographs were turned back.
         pictures: for people to check: the labelled photographs, the cloud turned.
     """
 
+    views: list[View]
     dentitions: list[Dentition | None]
     fit: ArchFit
     surface: ArchSurface
+    mirrored: tuple[int, ...] = ()
     pictures: Mapping[str, Picture] = field(default_factory=dict)
 
 
@@ -69,8 +74,6 @@ def reconstruct_teeth(
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
             with it, and the teeth with their numbers, so that the user can put them right.
     """
-    images = [view.image for view in views]
-    valid = [view.valid() for view in views]
     found = sum(dentition is not None for dentition in dentitions)
     if found < (2 if accept_doubtful or cameras is not None else LEAST_PHOTOGRAPHS):
         raise ReconstructionError(
@@ -79,7 +82,16 @@ def reconstruct_teeth(
             labelled(views, dentitions) if found else {},
             {"teeth": Teeth(tuple(d for d in dentitions if d is not None))} if found else {},
         )
-    fit = fit_arch(dentitions, images, valid, focals, arch, threads, progress, names, cameras)
+
+    def placed_by(views: list[View], dentitions: list[Dentition | None]) -> ArchFit:
+        images, valid = [view.image for view in views], [view.valid() for view in views]
+        return fit_arch(dentitions, images, valid, focals, arch, threads, progress, names, cameras)
+
+    if cameras is None:
+        turned = fit_turned(views, dentitions, names, placed_by)
+    else:
+        turned = Turned(views, dentitions, placed_by(views, dentitions))
+    views, dentitions, fit = turned.views, turned.dentitions, turned.fit
     numbered = [
         None if dentition is None else with_numbers(dentition, placed, fit)
         for dentition, placed in zip(dentitions, fit.views, strict=True)
@@ -95,8 +107,12 @@ def reconstruct_teeth(
             pictures,
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
-    dense = dense_surface(images, valid, numbered, fit, surface, threads, progress)
-    return Reconstruction(numbered, fit, dense, {**pictures, "turned": turned_sheet(dense)})
+    dense = dense_surface(
+        [view.image for view in views], [view.valid() for view in views], numbered, fit, surface,
+        threads, progress,
+    )  # fmt: skip
+    pictures["turned"] = turned_sheet(dense)
+    return Reconstruction(views, numbered, fit, dense, turned.mirrored, pictures)
 
 
 def with_numbers(dentition: Dentition, placed: PlacedView | None, fit: ArchFit) -> Dentition:

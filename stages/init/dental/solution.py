@@ -59,6 +59,7 @@ class ArchFit:
         confidence: 0..1, how far the numbers and the cameras can be trusted; doubts say why not
             where it is below .5.
         primary: permanent numbers in whose place primary teeth stand.
+        mirrored: photographs from the front that are mirror images if those of the sides are none.
     """
 
     views: tuple[PlacedView | None, ...]
@@ -70,6 +71,7 @@ class ArchFit:
     figures: dict[str, float] = field(default_factory=dict)
     primary: frozenset[int] = frozenset()
     confidence: float = 0.0
+    mirrored: tuple[int, ...] = ()
 
     def number_of(self, tooth: int) -> int:
         """FDI number of the tooth that stands in the place of a permanent one; 0 for 0."""

@@ -37,6 +37,7 @@ from stages.init.dental.numbering.edits import (
     improve,
     label_doubts,
     margins,
+    settle_ends,
     solve_shifted,
 )
 from stages.init.dental.numbering.hypotheses import (
@@ -47,8 +48,9 @@ from stages.init.dental.numbering.hypotheses import (
     search,
     view_candidates,
 )
+from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
 from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
-from stages.init.dental.numbering.sightings import seen_rows
+from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
 
@@ -150,28 +152,33 @@ def fit_arch(
     cost, primary = primary_teeth(scorer, best, read)
     if perhaps_primary(read):
         # A child's arch may tell another numbering than an adult's.
-        child = Scorer(rows, focal, deviation, scorer.options, threads, held, ALL_PRIMARY)
+        childs = [(as_a_childs(upper), as_a_childs(lower)) for upper, lower in rows]
+        child = Scorer(childs, focal, deviation, scorer.options, threads, held, ALL_PRIMARY)
         rival, rivals = _label(child, fixed, progress)
         rival_cost, rival_primary = primary_teeth(child, rival, read)
         if rival_cost < cost:
             scorer, best, others, primary = child, rival, rivals, rival_primary
+    best, ends = settle_ends(scorer, best, fixed)
     gaps = margins(best, others)
-    shares = label_doubts(best, others, rows)
+    shares = label_doubts(best, [*others, *ends])
     if primary != best.labelling.primary:
         start = (best.adjusted.unknowns, best.adjusted.offsets)
         best = scorer.solve(replace(best.labelling, primary=primary), start)
     common = common_mouth(scorer, best)
+    mirrored = mirror_evidence(scorer, best, read)
 
     best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],
                           [valid[i] for i in placeable], options, progress)  # fmt: skip
     bands = [dentition.band_height for dentition in read]
     colours = colour_distances([images[i] for i in placeable], read)
-    evidence = Evidence(gaps, common, colours, bands, pairs)
+    evidence = Evidence(gaps, common, mirrored, colours, bands, pairs)
     more, figures = fit_doubts(shown, scorer, best, evidence, options)
-    doubts += more
-    return _outcome(
+    doubts += more + _kind_doubts(best, read, shown)
+    found = _outcome(
         scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures, shares
     )
+    turned = {placeable[view] for view, factor in mirrored.items() if factor > MIRRORED}
+    return replace(found, mirrored=tuple(sorted(turned)))
 
 
 def _check(
@@ -325,6 +332,19 @@ def _role_doubts(best: Scored) -> list[str]:
         f"{roles.count(twice[0])} photographs look like {twice[0]} views and none like a "
         f"{' or a '.join(absent)} view: one of them may be mirrored, or taken twice"
     ]
+
+
+def _kind_doubts(best: Scored, dentitions: list[Dentition], photos: list[str]) -> list[str]:
+    """One photograph may look like what it is not; two are a wrong numbering."""
+    kinds = {"right": "right", "left": "left", "front": "frontal"}
+    odd = [
+        f"{photos[view]} (looks like {kinds[dentitions[view].kind]}, its teeth like {role})"
+        for view, role in zip(best.labelling.views, best.labelling.roles, strict=True)
+        if role in MAIN_ROLES and kinds.get(dentitions[view].kind, role) != role
+    ]
+    return [f"photographs don't show the sides that they look like: {', '.join(odd)}"] * (
+        len(odd) > 1
+    )
 
 
 def _refine(

@@ -38,6 +38,9 @@ class ArchOptions:
     #: What it costs to call a tooth missing in all photographs, or a crown merged, split or none.
     missing_cost: float = 20.0
     defect_cost: float = 12.0
+    #: What it costs that a tooth is hidden before the last crown of a row: from .5 to 3 as many
+    #: numbers of twelve patients come out right.
+    hidden_cost: float = 1.5
     #: Weight of what the crowns look like beside where they lie.
     looks_weight: float = 1.0
     #: Labellings of a photograph's rows that look likeliest and are tried.
@@ -57,9 +60,9 @@ class ArchOptions:
     #: Do all photographs show one mouth? The log Bayes factor by the places of the teeth in these
     #: units, and the distance of colours below the largest usual one by this weight, must not come
     #: to less than 0 together.
-    common_mouth_unit: float = 12.0
+    common_mouth_unit: float = 9.0
     colour_weight: float = 6.0
-    max_colour: float = 2.45
+    max_colour: float = 2.2
     #: Median landmark error above which the fit is doubted.
     max_error: float = 0.045
     #: Standard deviation of the angle between neighbouring views above which it is doubted.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.hypotheses import Scored, Scorer
+from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
 
 Array = npt.NDArray[np.float64]
 
@@ -62,6 +63,8 @@ class Evidence:
         margins: by how much its labelling beats the next, as `edits.margins` has it.
         common_mouth: per photograph, twice the log Bayes factor that it shows the same mouth as the
             others (`edits.common_mouth`).
+        mirrored: of photographs from the front, twice the log Bayes factor that they are mirror
+            images (`mirrored.mirror_evidence`).
         colours: per photograph, how far its colours are from the others' (`colours`).
         bands: per photograph, the height of its band of teeth, pixels.
         pairs: how the dense matches of pairs agree.
@@ -69,6 +72,7 @@ class Evidence:
 
     margins: tuple[float, float, float]
     common_mouth: Sequence[float]
+    mirrored: Mapping[int, float]
     colours: Sequence[float]
     bands: Sequence[float]
     pairs: dict[tuple[int, int], PairFigures]
@@ -136,6 +140,13 @@ def fit_doubts(
             f"{min(worst)[1]} may show another patient, or a mirrored picture: its colours and the "
             "places of its teeth fit the others' badly"
         )
+    for view, factor in evidence.mirrored.items():
+        figures[f"mirrored_{view}"] = factor
+        if factor > PERHAPS_MIRRORED:
+            doubts.append(
+                f"{photos[view]} seems to be a mirror image, or those of the sides are: its teeth "
+                "fit theirs better turned over"
+            )
     doubts += _view_doubts(photos, scorer, best, evidence.bands, figures, options)
     priors = scorer.priors(labelling.views, labelling.roles)
     for (i, j), pair in sorted(evidence.pairs.items()):

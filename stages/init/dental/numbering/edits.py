@@ -13,6 +13,7 @@ from pipeline.artifacts.fdi import JAWS, is_upper
 from stages.geometry.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
+from stages.init.dental.numbering.ends import end_labels, ends_cost, hidden_at_ends
 from stages.init.dental.numbering.hypotheses import (
     FINAL_STEPS,
     SEARCH_STEPS,
@@ -23,7 +24,6 @@ from stages.init.dental.numbering.hypotheses import (
     contiguous,
     row_defects,
 )
-from stages.init.dental.numbering.sightings import SeenRow
 from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
 Array = npt.NDArray[np.float64]
@@ -47,9 +47,8 @@ MAX_EDITS = 6
 NEAREST = 5
 #: Labellings that look less likely than the present one by more than this (evidence) are not tried.
 LOOKS_WINDOW = 60.0
-#: Up to so many teeth may be hidden before the last crown of a row, at this cost each (negative log
-#: probability): about one row in five of the closed bites looked at ends like that.
-HIDDEN_TEETH, HIDDEN_COST = 2, 1.5
+#: Up to so many teeth may be hidden before the last crown of a row.
+HIDDEN_TEETH = 2
 #: No number is surer than this: a doubt of 0 means that a person has said it.
 LEAST_DOUBT = 1e-4
 #: Labellings count as different ones when they name more crowns differently than this.
@@ -140,9 +139,7 @@ def missing_tooth_edits(labelling: Labelling, adjusted: Adjusted) -> list[Labell
             if tooth in labelling.absent:
                 continue
             inside = [
-                number
-                for number, labels in enumerate(labelling.labels)
-                if position in labels[jaw][1:-1]
+                number for number, labels in enumerate(labelling.labels) if position in labels[jaw]
             ]
             if not inside:
                 continue
@@ -242,9 +239,11 @@ def row_trial(
     )
     options = scorer.options
     total = adjusted.evidence + options.unused_cost * scorer.cache.unused(view, labels)
+    total += ends_cost(scorer.rows, (view,), (labels,), adjusted)
     for jaw in (0, 1):
         absent = frozenset(position_of(t) for t in labelling.absent if is_upper(t) == (jaw == 0))
         total += options.defect_cost * row_defects(labels[jaw], absent)
+        total += options.hidden_cost * hidden_at_ends(labels[jaw], absent)
     one = replace(labelling, views=(view,), roles=(role,), labels=(labels,))
     return total + scorer.looks(one)
 
@@ -374,27 +373,40 @@ def margins(best: Scored, others: list[Scored]) -> tuple[float, float, float]:
     return min(gaps[0]), min(gaps[1]), min(gaps[2])
 
 
-def end_doubt(row: SeenRow, labels: Labels, at_left: bool) -> float:
-    """Probability by looks that the last crown of a row is one further along, those between hidden.
+def settle_ends(scorer: Scorer, best: Scored, fixed: Fixed) -> tuple[Scored, list[Scored]]:
+    """Try every label that the last crown of each row may have.
 
-    Nothing but its looks tells of a row's last crown: its other side may be hidden.
+    Args:
+        scorer: of all photographs.
+        best: the labelling so far.
+        fixed: (view, jaw, crown) -> position, where a person has said it.
+
+    Returns:
+        The best labelling, and all others that were solved.
     """
-    end, beside = (0, 1) if at_left else (-1, -2)
-    if len(labels) < 2 or NO_TOOTH in (labels[end], labels[beside]):
-        return 0.0
-    outward = -1 if at_left else 1
-    shares = {}
-    for hidden in range(HIDDEN_TEETH + 1):
-        position = labels[beside] + outward * (1 + hidden)
-        if 0 <= position < POSITIONS:
-            shares[position] = np.exp(row.looks[end, position] - HIDDEN_COST * hidden)
-    total = sum(shares.values())
-    return float(1 - shares.get(labels[end], 0.0) / total) if total > 0 else 0.0
+    others: list[Scored] = []
+    for _ in range(MAX_EDITS):
+        labelling = best.labelling
+        jobs = [
+            with_row(labelling, number, jaw, row)
+            for number, both in enumerate(labelling.labels)
+            for jaw in (0, 1)
+            for row in end_labels(both[jaw], HIDDEN_TEETH)
+            if _allowed(labelling.views[number], jaw, row, fixed)
+        ]
+        start = (best.adjusted.unknowns, best.adjusted.offsets)
+        solved = scorer.solve_all([(job, start) for job in jobs], SEARCH_STEPS)
+        others += solved
+        nearest = min(solved, key=lambda s: (s.score, s.labelling.labels), default=best)
+        if nearest.score > best.score - MIN_GAIN:
+            break
+        others.append(best)
+        again = (nearest.adjusted.unknowns, nearest.adjusted.offsets)
+        best = scorer.solve(nearest.labelling, again)
+    return best, others
 
 
-def label_doubts(
-    best: Scored, others: list[Scored], rows: list[tuple[SeenRow, SeenRow]]
-) -> list[tuple[Doubts, Doubts]]:
+def label_doubts(best: Scored, others: list[Scored]) -> list[tuple[Doubts, Doubts]]:
     """Probability, view by view and row by row, that each crown's label is another one.
 
     Every labelling that was solved counts by its evidence; of equal ones the best counts.
@@ -402,7 +414,6 @@ def label_doubts(
     Args:
         best: the labelling chosen.
         others: all others that were solved.
-        rows: of all photographs.
     """
     scores: dict[tuple[ViewLabels, ...], float] = {}
     for scored in (best, *others):
@@ -414,9 +425,7 @@ def label_doubts(
     weights = {labels: np.exp(-(score - least) / 2) for labels, score in scores.items()}
     total = sum(weights.values())
     result = []
-    for number, (view, chosen) in enumerate(
-        zip(best.labelling.views, best.labelling.labels, strict=True)
-    ):
+    for number, chosen in enumerate(best.labelling.labels):
         both = []
         for jaw, own in enumerate(chosen):
             found = np.array(
@@ -425,10 +434,6 @@ def label_doubts(
                     for k, label in enumerate(own)
                 ]
             )
-            if len(own) > 1:
-                row = rows[view][jaw]
-                found[0] = max(found[0], end_doubt(row, own, at_left=True))
-                found[-1] = max(found[-1], end_doubt(row, own, at_left=False))
             both.append(tuple(float(doubt) for doubt in np.clip(found, LEAST_DOUBT, 1.0)))
         result.append((both[0], both[1]))
     return result

@@ -21,6 +21,7 @@ from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors
 from stages.init.dental.cameras.held import HeldCameras
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.numbering.ends import ends_cost, hidden_at_ends
 from stages.init.dental.numbering.sightings import LOOKS, SeenRow, SightingCache
 from stages.init.dental.template import POSITIONS, position_of, textbook_arch
 
@@ -87,6 +88,8 @@ def contiguous(first: int, count: int) -> Labels:
 def row_defects(labels: Labels, absent: frozenset[int]) -> int:
     """How many crowns of a row are merged, split, spurious or skipped under its labels.
 
+    Teeth hidden before its first or last crown are no defects (`ends.hidden_at_ends`).
+
     Args:
         labels: positions of the row's crowns.
         absent: positions of this jaw that are missing in the patient.
@@ -95,6 +98,8 @@ def row_defects(labels: Labels, absent: frozenset[int]) -> int:
     defects = 0
     for i, j in pairwise(named):
         nameless = j - i - 1
+        if not nameless and len(labels) > 2 and (i == 0 or j == len(labels) - 1):
+            continue
         skipped = sum(p not in absent for p in range(labels[i] + 1, labels[j]))
         if nameless or skipped:
             # One crown for two teeth and two crowns for one are one defect each.
@@ -174,7 +179,9 @@ class Scorer:
         )
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
             total += options.unused_cost * self.cache.unused(view, labels)
-            total += options.defect_cost * sum(row_defects(labels[j], absent[j]) for j in (0, 1))
+            for jaw in (0, 1):
+                total += options.defect_cost * row_defects(labels[jaw], absent[jaw])
+                total += options.hidden_cost * hidden_at_ends(labels[jaw], absent[jaw])
         if len(self.rows) == 3 and options.order is None:
             total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
         return total
@@ -200,7 +207,8 @@ class Scorer:
             held=self.held.of(labelling.views) if self.held and len(labelling.views) > 1 else None,
         )
         self.solved += 1
-        return Scored(labelling, adjusted, adjusted.evidence + self.costs(labelling))
+        ends = ends_cost(self.rows, labelling.views, labelling.labels, adjusted)
+        return Scored(labelling, adjusted, adjusted.evidence + self.costs(labelling) + ends)
 
     def solve_all(
         self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int

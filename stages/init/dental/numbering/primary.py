@@ -36,7 +36,7 @@ CHANGING_COST = 5.0
 LATE_MOLAR_COST, EARLY_MOLAR_COST = 8.0, 3.0
 #: Log odds by the looks of a crown at which primary and permanent are as likely: the reader has
 #: seen far fewer primary teeth than there are among children.
-EVEN_ODDS = -3.2
+EVEN_ODDS = -4.4
 #: Odds of one crown count no more than this.
 MOST_ODDS = 2.0
 #: Mean log odds this much below even still ask for a look at a child's arch.
