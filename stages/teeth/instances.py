@@ -31,7 +31,7 @@ LEAST_AREA = 0.06
 #: A crown's score is its mean probability of being tooth, less where its middle is lower than this.
 SURE_PEAK = 0.8
 #: Crowns scoring less are none. On photographs kept back from learning F1 grows from .86 at .45 to
-#: .91 at .75, but what is lost on the way are the faint teeth at the ends of rows and in deep bites;
+#: .91 at .75, but what is lost on the way are faint teeth at the ends of rows and in deep bites;
 #: many of those that count as wrong are such teeth, which have no outline there.
 LEAST_SCORE = 0.55
 #: Pixels of the finer maps, too.
