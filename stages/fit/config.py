@@ -224,7 +224,7 @@ class FitConfig(StageConfig):
         "(auto: up to 3 views that are far apart)",
     )
     hold_min_angle: float = number(
-        30.0, "hold_surface auto: neighbouring views further apart than this, degrees", ge=0, le=180
+        22.0, "hold_surface auto: neighbouring views further apart than this, degrees", ge=0, le=180
     )
     hold_strength: float = number(
         0.15, "share of the way back that a sure Gaussian goes after each step", ge=0, le=1
