@@ -15,8 +15,8 @@ from pipeline.artifacts.teeth import Crown, Dentition
 
 Array = npt.NDArray[np.float64]
 
-#: A row of teeth that lies this flat is not turned (radians): a view from above or below tilts it
-#: as much.
+#: A row of teeth that lies this flat, or stands this upright, is not turned further (radians): a
+#: view from above or below tilts it as much.
 NATURAL_TILT = math.radians(5)
 #: Shares of the band's height within which the gum line or biting edge counts as its extremum: the
 #: landmark is the middle of that stretch, for crowns end flat.
@@ -161,7 +161,8 @@ def row_roll(outlines: Sequence[Outline]) -> float:
         up = centres[upper].mean(axis=0) - centres[~upper].mean(axis=0)
         if up @ [math.sin(angle), -math.cos(angle)] < 0:
             angle += math.pi if angle <= 0 else -math.pi
-    return 0.0 if abs(angle) < NATURAL_TILT else angle
+    quarter = round(angle / (math.pi / 2)) * (math.pi / 2)
+    return quarter if abs(angle - quarter) < NATURAL_TILT else angle
 
 
 def _turned(points: Array, angle: float) -> Array:

@@ -14,21 +14,24 @@ Array = npt.NDArray[np.float64]
 
 
 def normalising_similarity(
-    cameras: Sequence[Camera], points: npt.NDArray[np.floating]
-) -> tuple[float, Array, Array]:
+    cameras: Sequence[Camera], points: npt.NDArray[np.floating],
+    downs: Sequence[Array] | None = None,
+) -> tuple[float, Array, Array]:  # fmt: skip
     """Similarity to a world with y down, z ahead, centre at the points' median, median depth 1.
 
     Args:
         cameras: at least one.
         points: [N, 3] world points, at least one.
+        downs: one direction [3] or more of the world that lead down, of length 1; None: those of
+            the photographs, as if none of them were rolled.
 
     Returns:
         (scale, rotation [3, 3], translation [3]) of new = s R old + t.
     """
-    down = np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    down = np.mean([c.rotation[1] for c in cameras] if downs is None else list(downs), axis=0)
     ahead = np.mean([camera.rotation[2] for camera in cameras], axis=0)
     if np.linalg.norm(down) < 1e-3:
-        down = cameras[0].rotation[1]
+        down = np.asarray(cameras[0].rotation[1] if downs is None else downs[0])
     down = down / np.linalg.norm(down)
     ahead = ahead - (ahead @ down) * down
     if np.linalg.norm(ahead) < 1e-3:  # cameras all around: the first one decides

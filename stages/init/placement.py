@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -42,12 +43,15 @@ class Placement:
     figures: dict[str, float | int | str] = field(default_factory=dict)
     links: Links | None = None
 
-    def normalised(self) -> Placement:
+    def normalised(self, downs: Sequence[Array] | None = None) -> Placement:
         """The same in a world that is centred, scaled and upright (`normalising_similarity`).
 
         `input_from_world` still leads to the same frame.
+
+        Args:
+            downs: directions [3] of the world that lead down, where they are known.
         """
-        motion = normalising_similarity(self.cameras, self.points)
+        motion = normalising_similarity(self.cameras, self.points, downs)
         scale, rotation, shift = motion
         old_from_new = np.eye(4)
         old_from_new[:3, :3] = rotation.T / scale

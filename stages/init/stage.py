@@ -29,7 +29,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 7
+    version = 8
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -140,12 +140,18 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
     mm, uncertainty = scale_from_widths(teeth.fit, config.dental.tooth_widths)
     mask = config.dental.mask_rest is not False
+    cameras = tuple(_camera(teeth.views[k], teeth, k) for k in order)
+    rolls = [d.roll if (d := teeth.dentitions[k]) else 0.0 for k in order]
+    downs = [
+        np.array([-np.sin(r), np.cos(r), 0]) @ c.rotation
+        for r, c in zip(rolls, cameras, strict=True)
+    ]
     placement = Placement(
         views=tuple(_masked(teeth.views[k], teeth, k, mask) for k in order),
-        cameras=tuple(_camera(teeth.views[k], teeth, k) for k in order),
+        cameras=cameras,
         points=surface.positions.astype(np.float64), seen=(), weights={},
         input_from_world=np.diag([mm, mm, mm, 1.0]), units="mm",
-    ).normalised()  # fmt: skip
+    ).normalised(downs)  # fmt: skip
     scale = mm / np.cbrt(np.linalg.det(placement.input_from_world[:3, :3]))
     world_from_mm = np.linalg.inv(placement.input_from_world) @ np.diag([mm, mm, mm, 1.0])
     rotation = world_from_mm[:3, :3] / scale

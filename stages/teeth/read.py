@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import softmax
 
 from pipeline.artifacts.fdi import JAWS, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
@@ -18,7 +19,7 @@ from stages.geometry.tooth_rows import (
     row_probabilities,
 )
 from stages.teeth.instances import Found, find_crowns
-from stages.teeth.network import HEIGHT, KINDS, WIDTH, Transform, fitted, look
+from stages.teeth.network import HEIGHT, KINDS, WIDTH, Answer, Transform, fitted, look
 from stages.teeth.numbers import looks
 
 Array32 = npt.NDArray[np.float32]
@@ -28,6 +29,13 @@ Bool = npt.NDArray[np.bool_]
 _MARGIN_X, _MARGIN_Y = 0.08, 0.10
 #: The first look must find so many crowns for a second one.
 _LEAST_CROWNS = 3
+#: Photographs that look less upright than this (`uprightness`) are looked at the other ways up, and
+#: turned for so much more, if both rows show so many crowns. Of 106 photographs from the front and
+#: the sides 92 % look more upright, and none on its side above 2.3; turned by 90 degrees they lose
+#: .6 at the least, and none of them gains more than .41 by 180.
+_UPRIGHT, _MORE_UPRIGHT, _LEAST_IN_ROW = 2.8, 0.5, 3
+#: Logit of the jaw that counts as much in that as certainty about a tooth's place.
+_JAW_UNIT = 5.0
 #: Numbers less probable than this are not kept.
 _LEAST_SHARE = 0.001
 
@@ -48,7 +56,11 @@ class Reading:
 
 
 def read_photograph(
-    image: Array32, valid: Bool, name: str, options: ChainOptions | None = None
+    image: Array32,
+    valid: Bool,
+    name: str,
+    options: ChainOptions | None = None,
+    quarters: int = 0,
 ) -> Reading:
     """Find the crowns in one photograph.
 
@@ -57,14 +69,16 @@ def read_photograph(
         valid: [H, W] bool: nothing is read outside.
         name: of the view.
         options: of the numbers.
+        quarters: of a turn anticlockwise that bring the photograph upright, unless it clearly looks
+            otherwise.
 
     Returns:
         The reading, in pixels of the photograph.
     """
     height, width = image.shape[:2]
     size = (width, height)
-    first = look(image, valid, fitted((height, width)), flip=False)
-    answer, crowns = first, find_crowns(first)
+    first, crowns = _first_look(image, valid, quarters)
+    answer = first
     if len(crowns) >= _LEAST_CROWNS:
         closer = look(image, valid, _closer(crowns), flip=True)
         again = find_crowns(closer)
@@ -79,6 +93,55 @@ def read_photograph(
     outlines = _outlines(crowns)
     dentition = dentition_of(outlines, name, size, likely)
     return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
+
+
+def _first_look(image: Array32, valid: Bool, quarters: int) -> tuple[Answer, list[Found]]:
+    """The whole photograph, the right way up if that is clear."""
+    answer, crowns = look_turned(image, valid, quarters)
+    upright = uprightness(answer, crowns)
+    if len(crowns) < _LEAST_CROWNS or upright > _UPRIGHT:
+        return answer, crowns
+    least = upright + _MORE_UPRIGHT
+    for more in (1, 2, 3):
+        turned, found = look_turned(image, valid, quarters + more)
+        value = uprightness(turned, found)
+        if shows_both_rows(found) and value > least:
+            answer, crowns, least = turned, found, value
+    return answer, crowns
+
+
+def look_turned(image: Array32, valid: Bool, quarters: int) -> tuple[Answer, list[Found]]:
+    """One look at the whole photograph turned anticlockwise by some quarters of a turn."""
+    answer = look(image, valid, _quarter_turned(image.shape[:2], quarters), flip=False)
+    return answer, find_crowns(answer)
+
+
+def shows_both_rows(crowns: list[Found]) -> bool:
+    """Are there some crowns of either jaw?"""
+    lower = sum(crown.lower > 0 for crown in crowns)
+    return min(lower, len(crowns) - lower) >= _LEAST_IN_ROW
+
+
+def _quarter_turned(shape: tuple[int, ...], quarters: int) -> Transform:
+    """As `fitted`, of the photograph turned anticlockwise by some quarters of a turn."""
+    height, width = shape[:2]
+    c, s = round(math.cos(quarters * math.pi / 2)), round(math.sin(quarters * math.pi / 2))
+    turn = np.array([[c, s], [-s, c]], np.float64)
+    corners = np.array([[0, 0], [width, height]]) @ turn.T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    fit = fitted((int(high[1] - low[1]), int(high[0] - low[0])))
+    return np.column_stack([fit[:, :2] @ turn, fit[:, 2] - fit[:, :2] @ low])
+
+
+def uprightness(answer: Answer, crowns: list[Found]) -> float:
+    """How much a photograph looks as if it stood upright, 0 to 4: sure of the crowns' places in
+    their quadrants, of their jaws, and of a view from the front or a side."""
+    if not crowns:
+        return 0.0
+    places = np.mean([softmax(crown.position).max() for crown in crowns])
+    jaws = np.mean([min(abs(crown.lower) / _JAW_UNIT, 2.0) for crown in crowns])
+    facing = np.exp(answer.kind[: KINDS.index("upper")]).sum()
+    return float(places + jaws + facing)
 
 
 def _closer(crowns: list[Found]) -> Transform:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from stages.init.dental.numbering.arch import ArchOptions, fit_arch
 from stages.init.dental.reconstruct import with_numbers
 from stages.init.dental.solution import ArchFit
 from stages.init.stage import InitStage
+from stages.teeth.reader import read_photographs
 from tests.stages.mouth_case import Case, mouth_case, relative_errors, true_numbers
 
 #: An arch as wide in front as the textbook's; with a narrower one the angles come out too small.
@@ -135,6 +137,25 @@ def test_primary_teeth_among_permanent_ones_are_told(seed: int) -> None:
         for row in true_numbers(photo, dentition).values():
             primary |= {permanent_of(tooth) for tooth in row if is_primary(tooth)}
     assert fit.primary == primary
+
+
+@pytest.mark.parametrize("quarters", [(2, 2, 2), (0, 1, 3)])
+def test_photographs_are_read_whichever_way_up_they_are(quarters: tuple[int, ...]) -> None:
+    """All from behind the patient's head; two that lost on which side they were taken."""
+    views = case("normal").views.views
+    turned = [
+        replace(view, image=np.ascontiguousarray(np.rot90(view.image, k)))
+        for view, k in zip(views, quarters, strict=True)
+    ]
+    upright = read_photographs(views, 1, lambda *_: None)
+    found = read_photographs(turned, 1, lambda *_: None)
+    for one, other, k in zip(upright, found, quarters, strict=True):
+        more = (other.dentition.roll - one.dentition.roll + k * np.pi / 2) / (2 * np.pi)
+        assert abs(more - round(more)) < 0.02
+        for jaw in JAWS:
+            numbers = [crown.number for crown in one.dentition.crowns(jaw)]
+            assert len(numbers) > 6
+            assert [crown.number for crown in other.dentition.crowns(jaw)] == numbers
 
 
 @pytest.mark.slow
