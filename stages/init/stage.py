@@ -14,7 +14,6 @@ from pipeline.stage import Stage, StageContext
 from stages.init.config import InitConfig
 
 if TYPE_CHECKING:
-    from pipeline.artifacts.teeth import Teeth
     from pipeline.checkup import Finding
     from stages.geometry.known_cameras import KnownCamera
     from stages.init.options import ClassicalOptions
@@ -184,8 +183,10 @@ def _from_features(context: StageContext, views: Views) -> None:
             pictures=config.match_pictures,
         )  # fmt: skip
     except ReconstructionError as unplaced:
-        if config.method != "auto" or not _teeth_are_worth_a_try(context, views):
+        if config.method != "auto":
             raise
+        if not _teeth_are_worth_a_try(context, views):
+            raise _with_what_was_set_aside(context, views, unplaced) from unplaced
         _from_teeth_instead(context, views, unplaced)
     else:
         densify(context, views, placement.normalised())
@@ -193,11 +194,35 @@ def _from_features(context: StageContext, views: Views) -> None:
 
 def _teeth_are_worth_a_try(context: StageContext, views: Views) -> bool:
     """Few photographs, and of teeth: the dental path may place what features could not."""
+    from stages.init.teeth import labelled_teeth
+
     if not context.has("teeth"):
         return False
-    teeth: Teeth = context.load("teeth")
+    teeth = labelled_teeth(context, views)
     shown = {dentition.name for dentition in teeth.chosen} & set(views.by_name())
     return DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1]
+
+
+def _with_what_was_set_aside(
+    context: StageContext, views: Views, unplaced: ReconstructionError
+) -> ReconstructionError:
+    """The failure; where teeth were read, with the photographs that are missing for them."""
+    from stages.init.place import photo_name
+    from stages.init.teeth import labelled_teeth
+
+    teeth = labelled_teeth(context, views) if context.has("teeth") else None
+    if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
+        return unplaced
+    names = {view.name: photo_name(view) for view in views.views}
+    aside = [f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside]
+    return ReconstructionError(
+        f"{unplaced} By their teeth at least {DENTAL_VIEWS[0]} photographs are needed that show "
+        f"the closed bite from the front and both sides, and {len(teeth.chosen)} of "
+        f"{len(teeth.views)} do ({'; '.join(aside)}). Add what is missing; if one was set aside "
+        "wrongly or is a mirror image, say so in check.html.",
+        unplaced.pictures,
+        {**unplaced.artifacts, "teeth": teeth},
+    )
 
 
 def _from_teeth_instead(context: StageContext, views: Views, unplaced: ReconstructionError) -> None:

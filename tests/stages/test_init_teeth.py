@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.artifacts.corrections import CORRECTIONS
 from pipeline.artifacts.fdi import is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
@@ -350,9 +351,9 @@ def no_features(monkeypatch):
     monkeypatch.setattr("stages.init.place.place_classical", unplaced)
 
 
-def auto(tmp_path, count, read=None, **config):
+def auto(tmp_path, count, read=None, sources=None, **config):
     inputs = {"views": photographs(count)} | ({"teeth": read} if read else {})
-    context = LocalContext(InitConfig(**config), tmp_path, inputs=inputs, threads=1)
+    context = LocalContext(InitConfig(**config), tmp_path, inputs, sources or {}, threads=1)
     InitStage().run(context)
     return context
 
@@ -376,6 +377,20 @@ def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatc
     assert tried == [1]
     auto(tmp_path / "more", 4, read_teeth(4, aside=(3,)))
     assert tried == [1, 1]
+
+
+def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
+    tmp_path, monkeypatch, no_features
+):
+    tried = []
+    monkeypatch.setattr("stages.init.teeth.from_teeth", lambda context, views: tried.append(1))
+    read = read_teeth(aside=(0,))
+    with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
+        auto(tmp_path / "a", 3, read)
+    assert caught.value.artifacts == {"teeth": read}
+    said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
+    auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
+    assert tried == [1]
 
 
 def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypatch, no_features):
