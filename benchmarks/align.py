@@ -28,12 +28,12 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.pointmaps import PointmapPair
 from pipeline.artifacts.views import View
+from pipeline.geometry.depths import view_depths
+from pipeline.geometry.start import start_from_tree
 from stages.align.bundle import BundleOptions, refine_with_matches
 from stages.align.fusion import FusionOptions, fuse
 from stages.align.optimise import AlignOptions, optimise
-from stages.geometry.depths import view_depths
-from stages.geometry.start import start_from_tree
-from stages.init.pointmap.graph import scene_pairs
+from stages.pointmaps.graph import scene_pairs
 
 CUBIC = cv2.INTER_CUBIC
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "twelve_frames"

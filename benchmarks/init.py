@@ -28,10 +28,10 @@ import numpy as np
 from init_scores import Truth, read_truth, rotation_errors, score_points, translation_errors
 
 from pipeline.errors import ReconstructionError
+from pipeline.geometry.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext, get_stage
 from stages.comparison.colmap_run import SETTINGS, Job, run_job
 from stages.comparison.models import model_folders
-from stages.geometry.known_cameras import model_files, read_cameras
 
 METHODS = ("colmap", "sparse", "ours")
 

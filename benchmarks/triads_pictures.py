@@ -12,7 +12,7 @@ import numpy.typing as npt
 from triads_data import SERIES
 from triads_run import Outcome
 
-from stages.geometry.teeth_overlay import sheet
+from stages.dentition.overlay import sheet
 
 Picture = npt.NDArray[np.uint8]
 #: Widths of a row of a sheet, pixels: of photographs of cases, of series, of turned scenes.

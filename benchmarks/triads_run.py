@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parent.parent
 #: What a reading depends on: the reader's files without those that choose among readings.
-READER = ("stages/teeth/*.onnx", "stages/teeth/*.py", "stages/geometry/crowns.py",
-          "stages/geometry/tooth_rows.py")  # fmt: skip
+READER = ("stages/teeth/*.onnx", "stages/teeth/*.py", "stages/dentition/crowns.py",
+          "stages/dentition/tooth_rows.py")  # fmt: skip
 NO_READER = ("choose.py", "stage.py", "config.py", "__init__.py")
 
 

@@ -14,7 +14,7 @@ from triads_run import Outcome
 
 from pipeline.artifacts.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.geometry.teeth_overlay import DOUBT_SHOWN
+from stages.dentition.overlay import DOUBT_SHOWN
 
 if TYPE_CHECKING:
     from stages.init.dental.solution import PlacedView

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.artifacts.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
-from stages.geometry.crowns import Outline, dentition_of
+from stages.dentition.crowns import Outline, dentition_of
 
 #: Pixels of the working image, and how many of the original one of them is.
 WIDTH, HEIGHT, SCALE = 300, 200, 4

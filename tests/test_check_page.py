@@ -16,8 +16,8 @@ from pipeline.artifacts.corrections import Corrections, read_corrections
 from pipeline.artifacts.teeth import Teeth
 from pipeline.report import run_report
 from pipeline.store import Store
-from stages.geometry.corrections import apply_corrections
-from stages.geometry.crowns import mirrored_dentition
+from stages.dentition.corrections import apply_corrections
+from stages.dentition.crowns import mirrored_dentition
 from tests import teeth_case as case
 from tests.browser import browse, console, needs_chromium
 from tests.report_case import write_result

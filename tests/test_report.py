@@ -12,13 +12,13 @@ import pytest
 
 import pipeline
 from pipeline.errors import ReconstructionError, RequestError
+from pipeline.geometry.world import move_camera
 from pipeline.report import run_report
 from pipeline.report.geometry import movement, similarity_onto
 from pipeline.report.pictures import flow_colors, picture, points_image, thirds
 from pipeline.report.tables import views_table
 from pipeline.runner import RunSummary
 from stages.evaluate.pictures import comparison
-from stages.geometry.world import move_camera
 from tests import report_case as case
 from tests.browser import browse, needs_chromium
 from tests.report_page import assert_alone, look, text_of

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.depths import ViewDepth
-from stages.geometry.world import move_camera, similarity_between
+from pipeline.geometry.depths import ViewDepth
+from pipeline.geometry.world import move_camera, similarity_between
 
 Array = npt.NDArray[np.float64]
 Feature = tuple[int, int]

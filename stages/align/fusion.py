@@ -11,7 +11,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.normals import depth_normals
+from pipeline.geometry.normals import depth_normals
 
 Array = npt.NDArray[np.float32]
 

@@ -23,6 +23,7 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.pointmaps import PointmapPair
+from pipeline.geometry.start import Start
 from stages.align.linearise import CAMERA, PAIR, linearise_view
 from stages.align.problem import (
     AlignOptions,
@@ -34,7 +35,6 @@ from stages.align.problem import (
     moved_by,
     problem,
 )
-from stages.geometry.start import Start
 
 __all__ = ["AlignOptions", "optimise"]
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.pointmaps import PointmapPair
+from pipeline.geometry.samples import grid_pixels, sampled
+from pipeline.geometry.start import Motion, Start
 from stages.align.linearise import CAMERA, PAIR
-from stages.geometry.samples import grid_pixels, sampled
-from stages.geometry.start import Motion, Start
 
 Array = npt.NDArray[np.float64]
 

@@ -127,10 +127,10 @@ class AlignStage(Stage):
 
         from pipeline.artifacts.cameras import Cameras
         from pipeline.artifacts.points import Points
+        from pipeline.geometry.depths import view_depths
+        from pipeline.geometry.start import start_from_cameras, start_from_tree
+        from pipeline.geometry.world import move_camera, normalising_similarity
         from stages.align.fusion import FusionOptions, fuse
-        from stages.geometry.depths import view_depths
-        from stages.geometry.start import start_from_cameras, start_from_tree
-        from stages.geometry.world import move_camera, normalising_similarity
 
         config: AlignConfig = context.config
         views = context.load("views")
@@ -274,10 +274,10 @@ def _focal_rules(config, views, start):  # type: ignore[no-untyped-def]
 
 def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-def]
     """The start with cameras that sparse matches have refined, where there are enough of them."""
+    from pipeline.geometry.depths import view_depths
+    from pipeline.geometry.start import start_from_cameras
     from stages.align.bundle import BundleOptions, refine_with_matches
     from stages.align.optimise import AlignOptions, optimise
-    from stages.geometry.depths import view_depths
-    from stages.geometry.start import start_from_cameras
 
     config: AlignConfig = context.config
     if config.hold_poses or len(start.cameras) < 2:
@@ -316,8 +316,8 @@ def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-
 
 def _back_in_world(start, given):  # type: ignore[no-untyped-def]
     """Optimised cameras in the world of those given: the frame that is known of it still holds."""
-    from stages.geometry.start import Start
-    from stages.geometry.world import move_camera, similarity_between
+    from pipeline.geometry.start import Start
+    from pipeline.geometry.world import move_camera, similarity_between
 
     known = given.by_name()
     names = sorted(start.cameras)

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
+from pipeline.geometry.mesh import Mesh, distance_figures
+from pipeline.geometry.similarity import similarity
 from stages.comparison.poses import Motion
-from stages.geometry.mesh import Mesh, distance_figures
-from stages.geometry.similarity import similarity
 
 Array = npt.NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.pose_metrics import pose_figures
-from stages.geometry.rigid import rotation_angle
-from stages.geometry.similarity import camera_similarity, moved_camera
+from pipeline.geometry.pose_metrics import pose_figures
+from pipeline.geometry.rigid import rotation_angle
+from pipeline.geometry.similarity import camera_similarity, moved_camera
 
 Array = npt.NDArray[np.float64]
 Motion = tuple[float, Array, Array]

@@ -14,6 +14,7 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
+from pipeline.geometry.pose_metrics import pose_figures
 from pipeline.stage import StageContext
 from stages.evaluate import pictures
 from stages.evaluate.config import EvaluateConfig
@@ -31,7 +32,6 @@ from stages.evaluate.scene import Examiner
 from stages.evaluate.score import Figures, summary_of
 from stages.evaluate.support import LEGEND, SeenSurface, beyond
 from stages.evaluate.truth import Truth, read_truth, scoring_mask
-from stages.geometry.pose_metrics import pose_figures
 
 #: The input views trained the scene, so that their figures say nothing about unseen views. They
 #: are of final renders at 8 bits; the PSNR that the fit reports on its way is a running mean over
@@ -263,8 +263,8 @@ def _geometry(
     files = labelled(context.sources, "mesh")
     if not files:
         return None
+    from pipeline.geometry.mesh import Mesh
     from stages.evaluate.geometry import geometry_figures
-    from stages.geometry.mesh import Mesh
 
     config: EvaluateConfig = context.config
     context.progress("geometry", 0, 1)

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.mesh import Mesh
 from stages.evaluate.held_out import ALIGNMENT, Registration
 from stages.evaluate.support import SeenSurface, supporting_views
 from stages.evaluate.surface import icp, surface_figures
-from stages.geometry.mesh import Mesh
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

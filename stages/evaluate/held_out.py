@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.geometry.similarity import camera_similarity, moved_camera
+from pipeline.geometry.similarity import camera_similarity, moved_camera
 
 Array = npt.NDArray[np.float64]
 
@@ -131,8 +131,8 @@ def common_lens(views: Sequence[View]) -> str | None:
 
 def without_lens(view: View, lens: str) -> View:
     """A photograph with the distortion of a lens (`View.lens_taken_out`) taken out of it."""
-    from stages.geometry.colmap import quiet_pycolmap
-    from stages.geometry.known_cameras import KnownCamera, as_pinhole
+    from pipeline.geometry.colmap import quiet_pycolmap
+    from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
 
     model, width, height, *parameters = lens.split()
     camera = quiet_pycolmap().Camera(

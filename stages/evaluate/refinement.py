@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.rigid import moved_by
+from pipeline.geometry.rigid import moved_by
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]

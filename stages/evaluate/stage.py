@@ -30,8 +30,8 @@ class EvaluateStage(Stage):
     )  # fmt: skip
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
+        from pipeline.geometry.known_cameras import model_files
         from stages.evaluate.perceptual import find_vgg_weights
-        from stages.geometry.known_cameras import model_files
 
         found: dict[str, Path] = {}
         if config.ground_truth is not None:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.rigid import exponential
+from pipeline.geometry.rigid import exponential
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stages.geometry.mesh import Mesh, distance_figures
-from stages.geometry.similarity import similarity
+from pipeline.geometry.mesh import Mesh, distance_figures
+from pipeline.geometry.similarity import similarity
 
 Array = npt.NDArray[np.float64]
 

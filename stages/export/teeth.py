@@ -138,8 +138,12 @@ def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array
     scaled = outline * (np.array([view.width, view.height]) / np.array(size))
     if not view.lens_taken_out:
         return np.asarray(scaled, np.float64)
-    from stages.geometry.colmap import quiet_pycolmap
-    from stages.geometry.known_cameras import KnownCamera, pinhole_camera, working_pixels_from_lens
+    from pipeline.geometry.colmap import quiet_pycolmap
+    from pipeline.geometry.known_cameras import (
+        KnownCamera,
+        pinhole_camera,
+        working_pixels_from_lens,
+    )
 
     model, width, height, *parameters = view.lens_taken_out.split()
     lens = quiet_pycolmap().Camera(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from stages.geometry.rigid import moved_by
+from pipeline.geometry.rigid import moved_by
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]

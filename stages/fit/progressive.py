@@ -28,11 +28,11 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
+from pipeline.geometry.order import viewing_order
 from stages.fit.initial import Cloud, initial_gaussians, thin
 from stages.fit.objectives import interpolate
 from stages.fit.settings import FitSettings
 from stages.fit.targets import point_depth
-from stages.geometry.order import viewing_order
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer

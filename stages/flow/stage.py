@@ -210,8 +210,8 @@ def _choose_pairs(
 
     Without cameras (None) the viewing order is that of the views, and no angle is known.
     """
+    from pipeline.geometry.order import viewing_order
     from stages.flow.order import neighbour_pairs, parallax_angle
-    from stages.geometry.order import viewing_order
 
     if cameras is None:
         order = list(range(len(views)))

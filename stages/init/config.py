@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pipeline.stage import StageConfig, runtime
-from stages.init.dense.options import DenseOptions
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.options import RefinementOptions
-from stages.init.pointmap.options import PointmapOptions
+from stages.init.sfm.options import RefinementOptions
+from stages.pointmaps.options import PointmapOptions
+from stages.stereo.options import DenseOptions
 
 #: Defaults are said once, where they were measured.
 DENSE = DenseOptions()

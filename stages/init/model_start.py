@@ -9,9 +9,9 @@ import numpy as np
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
+from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.model_points import as_points, read_model_points
 from pipeline.stage import StageContext
-from stages.geometry.known_cameras import KnownCamera, as_pinhole
-from stages.geometry.model_points import as_points, read_model_points
 from stages.init.config import InitConfig
 from stages.init.place import photo_name
 from stages.init.placement import Placement

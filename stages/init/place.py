@@ -12,15 +12,16 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
-from stages.geometry.known_cameras import KnownCamera, as_pinhole, rounded
-from stages.init.classical import Attempt, find_features, match_views, reconstruct
-from stages.init.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
-from stages.init.geometry import Correspondences, Pair
-from stages.init.match_pictures import Links, match_pictures
-from stages.init.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
+from pipeline.geometry.graph import Pair
+from pipeline.geometry.known_cameras import KnownCamera, as_pinhole, rounded
 from stages.init.placement import Placement
-from stages.init.triangulate import agreeing_matches, link_tracks, triangulate
-from stages.init.undistort import undistort_image
+from stages.init.sfm.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
+from stages.init.sfm.matching.pictures import Links, match_pictures
+from stages.init.sfm.matching.two_view import Correspondences
+from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
+from stages.init.sfm.reconstruct import Attempt, find_features, match_views, reconstruct
+from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
+from stages.init.sfm.undistort import undistort_image
 
 Progress = Callable[[str, int, int], None]
 Warn = Callable[[str], None]
@@ -44,7 +45,7 @@ def place_classical(
     least_views: int, options: ClassicalOptions, refinement: RefinementOptions, *, seed: int,
     threads: int, scratch: Path, progress: Progress, warn: Warn, pictures: int = 0,
 ) -> Placement:  # fmt: skip
-    """Cameras from features and COLMAP's mappers (`stages.init.classical`).
+    """Cameras from features and COLMAP's mappers (`stages.init.sfm.reconstruct`).
 
     Args:
         focals: of each view in pixels, or None.

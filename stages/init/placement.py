@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
-from stages.geometry.world import move_camera, normalising_similarity
-from stages.init.geometry import Pair
-from stages.init.match_pictures import Links
+from pipeline.geometry.graph import Pair
+from pipeline.geometry.world import move_camera, normalising_similarity
+from stages.init.sfm.matching.pictures import Links
 
 Array = npt.NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from stages.init.config import InitConfig
 
 if TYPE_CHECKING:
     from pipeline.checkup import Finding
-    from stages.geometry.known_cameras import KnownCamera
-    from stages.init.options import ClassicalOptions
-    from stages.init.pointmap.options import PointmapOptions
+    from pipeline.geometry.known_cameras import KnownCamera
+    from stages.init.sfm.options import ClassicalOptions
+    from stages.pointmaps.options import PointmapOptions
 
 
 #: How few and how many photographs the dental path takes on its own accord.
@@ -67,7 +67,7 @@ class InitStage(Stage):
 
     def findings(self) -> Iterable[Finding]:
         from pipeline.checkup import Finding
-        from stages.init.pointmap.predict import available, cards
+        from stages.pointmaps.predict import available, cards
 
         installed = set(available())
         for card in cards():
@@ -97,7 +97,7 @@ class InitStage(Stage):
         elif pointmaps := _pointmap_options(config):
             _from_pointmaps(context, views, pointmaps)
         elif config.method == "dental":
-            from stages.init.teeth import from_teeth
+            from stages.init.dental.place import from_teeth
 
             from_teeth(context, views)
         else:
@@ -106,7 +106,7 @@ class InitStage(Stage):
 
 def _inputs(config: InitConfig) -> Mapping[str, Path]:
     """The files that the settings name: cameras, or pointmaps and weights."""
-    from stages.geometry.known_cameras import model_files
+    from pipeline.geometry.known_cameras import model_files
 
     if config.cameras is not None:
         if config.method not in ("auto", "known", "dental"):
@@ -134,7 +134,7 @@ def _inputs(config: InitConfig) -> Mapping[str, Path]:
     options = _pointmap_options(config)
     if options is None:
         return {}
-    from stages.init.pointmap.predict import source_files
+    from stages.pointmaps.predict import source_files
 
     return source_files(options)
 
@@ -148,8 +148,8 @@ def _camera_files(sources: Mapping[str, Path]) -> list[Path]:
 
 def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
     """How to ask a pointmap model, or None where the method is another."""
-    from stages.init.pointmap.options import METHODS, PointmapOptions
-    from stages.init.pointmap.predict import available
+    from stages.pointmaps.options import METHODS, PointmapOptions
+    from stages.pointmaps.predict import available
 
     method: str = config.method
     if method == "auto" and config.pointmap.checkpoint is not None:
@@ -167,9 +167,9 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 
 def _from_features(context: StageContext, views: Views) -> None:
-    from stages.init.diagnosis import least_views
-    from stages.init.options import RefinementOptions
     from stages.init.place import place_classical, with_focals
+    from stages.init.sfm.diagnosis import least_views
+    from stages.init.sfm.options import RefinementOptions
     from stages.init.write import densify
 
     config: InitConfig = context.config
@@ -194,7 +194,7 @@ def _from_features(context: StageContext, views: Views) -> None:
 
 def _teeth_are_worth_a_try(context: StageContext, views: Views) -> bool:
     """Few photographs, and of teeth: the dental path may place what features could not."""
-    from stages.init.teeth import labelled_teeth
+    from stages.init.dental.place import labelled_teeth
 
     if not context.has("teeth"):
         return False
@@ -207,8 +207,8 @@ def _with_what_was_set_aside(
     context: StageContext, views: Views, unplaced: ReconstructionError
 ) -> ReconstructionError:
     """The failure; where teeth were read, with the photographs that are missing for them."""
+    from stages.init.dental.place import labelled_teeth
     from stages.init.place import photo_name
-    from stages.init.teeth import labelled_teeth
 
     teeth = labelled_teeth(context, views) if context.has("teeth") else None
     if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
@@ -226,7 +226,7 @@ def _with_what_was_set_aside(
 
 
 def _from_teeth_instead(context: StageContext, views: Views, unplaced: ReconstructionError) -> None:
-    from stages.init.teeth import from_teeth
+    from stages.init.dental.place import from_teeth
 
     context.progress("features do not link the photographs; trying the teeth", 0, 1)
     try:
@@ -241,7 +241,7 @@ def _from_teeth_instead(context: StageContext, views: Views, unplaced: Reconstru
 
 
 def _classical_options(config: InitConfig) -> ClassicalOptions:
-    from stages.init.options import ClassicalOptions
+    from stages.init.sfm.options import ClassicalOptions
 
     return ClassicalOptions(
         **{name: getattr(config, name) for name in ClassicalOptions.__dataclass_fields__}
@@ -249,7 +249,7 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
-    from stages.geometry.known_cameras import matching_cameras, read_cameras
+    from pipeline.geometry.known_cameras import matching_cameras, read_cameras
     from stages.init.place import place_known
     from stages.init.write import densify
 
@@ -263,7 +263,7 @@ def _from_known_cameras(context: StageContext, views: Views) -> None:
         from_model(context, views, known, units)
         return
     if config.method == "dental" or _teeth_are_wide_apart(context, views, known):
-        from stages.init.known_teeth import from_known_teeth
+        from stages.init.dental.place_known import from_known_teeth
 
         try:
             from_known_teeth(context, views, known, units)
@@ -287,8 +287,8 @@ def _teeth_are_wide_apart(
     context: StageContext, views: Views, known: dict[str, KnownCamera]
 ) -> bool:
     """Few photographs of teeth with known cameras, too far apart for dense stereo."""
-    from stages.geometry.known_cameras import pinhole_camera
-    from stages.init.known_teeth import neighbour_angle
+    from pipeline.geometry.known_cameras import pinhole_camera
+    from stages.init.dental.place_known import neighbour_angle
 
     config: InitConfig = context.config
     if config.dense.method != "auto":
@@ -301,9 +301,9 @@ def _teeth_are_wide_apart(
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:
     from stages.init.place import photo_name, with_focals
-    from stages.init.pointmap.predict import predict_pointmaps
-    from stages.init.pointmap.quick_start import quick_start
     from stages.init.write import save_all
+    from stages.pointmaps.predict import predict_pointmaps
+    from stages.pointmaps.quick_start import quick_start
 
     config: InitConfig = context.config
     pairs = predict_pointmaps(

@@ -15,13 +15,13 @@ from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
+from pipeline.geometry import cloud
+from pipeline.geometry.graph import spanning_pairs
 from pipeline.stage import StageContext
-from stages.init import cloud
 from stages.init.config import InitConfig
-from stages.init.dense import DenseOptions, dense_depths
-from stages.init.geometry import spanning_tree
-from stages.init.match_pictures import Links, match_pictures, match_table
 from stages.init.scale import mm_per_unit, photo_named
+from stages.init.sfm.matching.pictures import Links, match_pictures, match_table
+from stages.stereo import DenseOptions, dense_depths
 
 if TYPE_CHECKING:
     from stages.init.placement import Placement
@@ -66,7 +66,7 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
             )
     result = cloud.thinned(cloud.joined(clouds), config.max_points, context.seed)
     depths = [np.where(found.depth > 0, found.depth, found.filled) for found in dense]
-    tree = spanning_tree(placement.weights, len(cameras))
+    tree = spanning_pairs(placement.weights)
     pairs = [
         cloud.pointmap_pair(
             cameras[i], cameras[j], depths[i], depths[j], dense[i].confidence, dense[j].confidence

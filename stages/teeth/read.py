@@ -11,8 +11,8 @@ from scipy.special import softmax
 
 from pipeline.artifacts.fdi import JAWS, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.geometry.crowns import Outline, centroid, dentition_of, row_roll
-from stages.geometry.tooth_rows import (
+from stages.dentition.crowns import Outline, centroid, dentition_of, row_roll
+from stages.dentition.tooth_rows import (
     POSITIONS,
     ChainOptions,
     position_evidence,

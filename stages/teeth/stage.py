@@ -34,7 +34,7 @@ class TeethStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.teeth import Dentition, Teeth
-        from stages.geometry.teeth_overlay import DOUBT_SHOWN, labelled_overlay
+        from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.teeth.choose import ChoiceOptions, choose
         from stages.teeth.reader import read_photographs, shows_teeth
 

@@ -23,7 +23,7 @@ from pipeline.artifacts.corrections import (
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.store import Store
-from stages.geometry.corrections import LEFT_OUT, apply_corrections, area, split_polygon
+from stages.dentition.corrections import LEFT_OUT, apply_corrections, area, split_polygon
 from tests import teeth_case as case
 
 GOOD = """

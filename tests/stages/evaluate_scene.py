@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from pipeline.artifacts.gaussians import Gaussians
-from stages.geometry.rigid import exponential
-from stages.geometry.similarity import moved_camera
+from pipeline.geometry.rigid import exponential
+from pipeline.geometry.similarity import moved_camera
 
 
 def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.init.geometry import Correspondences, Lens, angle_between, coherent_matches
-from stages.init.mapping import MappingInput
+from stages.init.sfm.mapping import MappingInput
+from stages.init.sfm.matching.two_view import Correspondences, Lens, angle_between, coherent_matches
 
 WIDTH, HEIGHT, FOCAL = 512, 384, 700.0
 

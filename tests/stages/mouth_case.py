@@ -18,7 +18,7 @@ from data_samples.mouths.cameras import Camera, look
 from pipeline.artifacts.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
-from stages.geometry.crowns import Outline, dentition_of
+from stages.dentition.crowns import Outline, dentition_of
 
 WIDTH, HEIGHT = 512, 384
 ROLES = ("right", "front", "left")

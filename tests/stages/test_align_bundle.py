@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.views import View, Views
+from pipeline.geometry.depths import view_depths
+from pipeline.geometry.start import start_from_tree
 from pipeline.stage import LocalContext
 from stages.align.bundle import BundleOptions, refine_with_matches
 from stages.align.optimise import AlignOptions, optimise
 from stages.align.stage import AlignConfig, AlignStage
-from stages.geometry.depths import view_depths
-from stages.geometry.start import start_from_tree
 from tests.stages import dense_scene as scene
 
 SIZE = (320, 240)

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from stages.geometry.similarity import (
+from pipeline.geometry.graph import spanning_forest
+from pipeline.geometry.similarity import (
     pose_from_points,
     robust_similarity,
     similarity,
     weiszfeld_focal,
 )
-from stages.geometry.start import spanning_tree
-from stages.geometry.world import move_camera, normalising_similarity
+from pipeline.geometry.world import move_camera, normalising_similarity
 
 RNG = np.random.default_rng(0)
 TURN = Rotation.from_euler("xyz", [20, -35, 10], degrees=True).as_matrix()
@@ -73,8 +73,8 @@ def test_focal_and_pose_from_a_pointmap_with_outliers():
 
 def test_spanning_tree_takes_the_best_edges_and_the_largest_tree_first():
     edges = [("a", "b", 1.0), ("b", "c", 3.0), ("a", "c", 2.0), ("d", "e", 9.0), ("e", "f", 0.0)]
-    assert spanning_tree(edges) == [[1, 2], [3]]
-    assert spanning_tree([("a", "b", 0.0)]) == []
+    assert spanning_forest(edges) == [[1, 2], [3]]
+    assert spanning_forest([("a", "b", 0.0)]) == []
 
 
 def test_normalised_world_has_unit_depth_and_y_down():

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.views import View, Views
+from pipeline.geometry.similarity import refined_pose
+from pipeline.geometry.start import Start, start_from_cameras, start_from_tree
+from pipeline.geometry.world import move_camera, similarity_between
 from pipeline.stage import LocalContext
 from stages.align.linearise import linearise_view
 from stages.align.optimise import AlignOptions, optimise
 from stages.align.stage import AlignConfig, AlignStage
-from stages.geometry.similarity import refined_pose
-from stages.geometry.start import Start, start_from_cameras, start_from_tree
-from stages.geometry.world import move_camera, similarity_between
 from tests.stages import dense_scene as scene
 
 ANGLES = (-24.0, -10.0, 4.0, 18.0)

@@ -15,11 +15,11 @@ from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
+from pipeline.geometry.depths import view_depths
+from pipeline.geometry.start import start_from_cameras, start_from_tree
 from pipeline.stage import LocalContext, get_stage
 from stages.align.fusion import FusionOptions, fuse
 from stages.align.stage import AlignConfig, AlignStage
-from stages.geometry.depths import view_depths
-from stages.geometry.start import start_from_cameras, start_from_tree
 from tests.stages import dense_scene as _scene
 
 ANGLES = (-24.0, -8.0, 6.0, 21.0)

@@ -11,10 +11,10 @@ import pytest
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
+from pipeline.geometry.model_points import as_points, read_model_points
 from stages.comparison import clouds, evidence, poses
 from stages.comparison.colmap_run import SETTINGS, Job, as_stored, run_job, run_on_views, thresholds
 from stages.comparison.models import read_largest
-from stages.geometry.model_points import as_points, read_model_points
 from stages.views.orientation import make_upright, upright_from_stored
 from tests.stages.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 

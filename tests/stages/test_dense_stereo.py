@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.init.dense import DenseOptions, DenseView, dense_depths
-from stages.init.dense.appearance import highlights, normals_from_depth, to_gray
-from stages.init.dense.polish import polish, source_maps
-from stages.init.dense.sgbm import sgbm_depth
-from stages.init.dense.sources import inverse_depth_range, scene_points, select_sources
-from stages.init.dense.sweep import stack_sources
+from stages.stereo import DenseOptions, DenseView, dense_depths
+from stages.stereo.appearance import highlights, normals_from_depth, to_gray
+from stages.stereo.polish import polish, source_maps
+from stages.stereo.sgbm import sgbm_depth
+from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
+from stages.stereo.sweep import stack_sources
 from tests.stages.dense_scene import camera, render, scene
 
 # On so small an image depth changes four times as fast from pixel to pixel: smaller penalties.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.geometry.tooth_rows import NO_TOOTH
+from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.ends import MOST_COST, end_labels, ends_cost, hidden_at_ends
 from stages.init.dental.numbering.hypotheses import row_defects
 from stages.init.dental.numbering.sightings import SeenRow

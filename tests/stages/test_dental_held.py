@@ -11,10 +11,10 @@ from stages.init.dental.cameras.centred import centre_view
 from stages.init.dental.cameras.held import HeldCameras, nearest_similarity
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.place_known import neighbour_angle
 from stages.init.dental.surface.charts import Chart
 from stages.init.dental.surface.grow import go_on_straight
 from stages.init.dental.template import textbook_arch
-from stages.init.known_teeth import neighbour_angle
 from tests.stages import test_dental_arch as arch_scene
 from tests.stages.test_dental_surface_parts import row_of_teeth
 

@@ -13,8 +13,8 @@ from pipeline.artifacts.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
-from stages.geometry.crowns import mirrored_dentition
-from stages.geometry.tooth_rows import NO_TOOTH, Labels
+from stages.dentition.crowns import mirrored_dentition
+from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.config import InitConfig
 from stages.init.dental.cameras.held import HeldCameras, held_cameras
 from stages.init.dental.numbering.arch import fit_arch
@@ -120,8 +120,8 @@ def test_a_mirrored_front_is_doubted_and_named() -> None:
 
 
 def test_init_turns_a_mirrored_front_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.init.teeth.arch_options", lambda *_: QUICK)
-    monkeypatch.setattr("stages.init.teeth.surface_options", lambda *_: ROUGH)
+    monkeypatch.setattr("stages.init.dental.place.arch_options", lambda *_: QUICK)
+    monkeypatch.setattr("stages.init.dental.place.surface_options", lambda *_: ROUGH)
     photographed = case()
     taken: list[View] = [
         replace(view, source_name=f"{photo.view}.jpg")

@@ -14,10 +14,10 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import HeldOut, View, Views, to_uint8, write_png
 from pipeline.errors import RequestError
+from pipeline.geometry.known_cameras import OPENCV_FROM_OPENGL
 from pipeline.stage import LocalContext
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.stage import EvaluateStage
-from stages.geometry.known_cameras import OPENCV_FROM_OPENGL
 from stages.splatting import render
 from tests.stages.evaluate_scene import arc, moved_world, rotation, textured_scene
 

@@ -10,9 +10,7 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.evaluate.held_out import common_lens, register, without_lens
-from stages.evaluate.refinement import RefinementOptions, refine_camera
-from stages.geometry.pose_metrics import (
+from pipeline.geometry.pose_metrics import (
     auc,
     centres_of,
     pose_figures,
@@ -22,8 +20,10 @@ from stages.geometry.pose_metrics import (
     rotation_errors,
     rpe,
 )
-from stages.geometry.rigid import moved_by, rotation_angle
-from stages.geometry.similarity import camera_similarity, similarity
+from pipeline.geometry.rigid import moved_by, rotation_angle
+from pipeline.geometry.similarity import camera_similarity, similarity
+from stages.evaluate.held_out import common_lens, register, without_lens
+from stages.evaluate.refinement import RefinementOptions, refine_camera
 from stages.splatting import render
 from tests.stages.evaluate_scene import arc, moved_world, pose, rotation, textured_scene
 

@@ -11,6 +11,8 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.rigid import exponential
 from stages.evaluate.geometry import geometry_figures
 from stages.evaluate.held_out import register
 from stages.evaluate.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights, flip_map
@@ -25,8 +27,6 @@ from stages.evaluate.support import (
     unsupported_share,
 )
 from stages.evaluate.surface import f_score, icp, nearest_distances, surface_figures, thinned
-from stages.geometry.mesh import Mesh
-from stages.geometry.rigid import exponential
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 TWO = np.array([[0, 1, 2], [0, 2, 3]])

@@ -12,6 +12,7 @@ import pytest
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
+from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage
@@ -22,7 +23,6 @@ from stages.export.teeth import (
     joint_centre,
     without_names,
 )
-from stages.geometry.known_cameras import KnownCamera, as_pinhole
 from tests.stages import export_scene as scene
 
 #: our world -> the input's millimetres

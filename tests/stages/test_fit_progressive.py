@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.views import View, Views
+from pipeline.geometry.rigid import exponential
 from stages.fit.config import FitConfig
 from stages.fit.initial import Cloud, initial_gaussians
 from stages.fit.poses import PoseOptimizer
 from stages.fit.progressive import next_pose
 from stages.fit.stage import FitStage
-from stages.geometry.rigid import exponential
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack
 from tests.stages.test_fit_trainer import StoppedError, case, context, looking, outputs, surface

@@ -12,10 +12,10 @@ from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
+from pipeline.geometry.rigid import exponential
 from pipeline.stage import LocalContext
 from stages.fit.initial import Cloud, initial_gaussians
 from stages.fit.stage import FitConfig, FitStage
-from stages.geometry.rigid import exponential
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.order import viewing_order
 from stages.flow.order import neighbour_pairs, parallax_angle
-from stages.geometry.order import viewing_order
 
 
 def orbit(angles: np.ndarray, radius: float = 5.0) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from stages.init.classical import Attempt, Evidence
-from stages.init.diagnosis import Limits, failure, warnings_of
-from stages.init.geometry import TwoView
-from stages.init.mapping import Solution
+from stages.init.sfm.diagnosis import Limits, failure, warnings_of
+from stages.init.sfm.mapping import Solution
+from stages.init.sfm.matching.two_view import TwoView
+from stages.init.sfm.reconstruct import Attempt, Evidence
 
 NAMES = ["right.jpg", "front.jpg", "left.jpg"]
 

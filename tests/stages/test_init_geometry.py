@@ -7,21 +7,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from stages.init.focal import better, search_focal
-from stages.init.geometry import (
+from pipeline.geometry.graph import spanning_pairs
+from stages.init.placement import Placement
+from stages.init.sfm.focal import better, search_focal
+from stages.init.sfm.mapping import Solution, map_views
+from stages.init.sfm.matching.two_view import (
     Correspondences,
     Lens,
     TwoView,
     angle_between,
     coherent_matches,
-    spanning_tree,
     trusted_edges,
     verify_pair,
 )
-from stages.init.mapping import Solution, map_views
-from stages.init.options import ClassicalOptions
-from stages.init.placement import Placement
-from stages.init.solver import Solver, known_focal, unknown_focal
+from stages.init.sfm.options import ClassicalOptions
+from stages.init.sfm.solver import Solver, known_focal, unknown_focal
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, orbit, worst_rotation
 
 
@@ -67,7 +67,7 @@ def test_coherence_tells_matches_that_move_alone():
 
 
 def test_spanning_tree_takes_the_heaviest_edges():
-    tree = spanning_tree({(0, 1): 5.0, (1, 2): 4.0, (0, 2): 3.0, (3, 4): 1.0}, 5)
+    tree = spanning_pairs({(0, 1): 5.0, (1, 2): 4.0, (0, 2): 3.0, (3, 4): 1.0})
     assert tree == [(0, 1), (1, 2), (3, 4)]
 
 

@@ -11,23 +11,23 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.stage import LocalContext
-from stages.geometry.known_cameras import (
+from pipeline.geometry.known_cameras import (
     KnownCamera,
     as_pinhole,
     matching_cameras,
     model_files,
     read_cameras,
 )
-from stages.init.geometry import Correspondences
+from pipeline.stage import LocalContext
 from stages.init.scale import mm_per_unit, working_pixel
-from stages.init.stage import InitConfig, InitStage
-from stages.init.triangulate import (
+from stages.init.sfm.matching.two_view import Correspondences
+from stages.init.sfm.triangulate import (
     agreeing_matches,
     epipolar_distance,
     link_tracks,
     triangulate,
 )
+from stages.init.stage import InitConfig, InitStage
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
 TRUTH = json.loads((SAMPLES / "transforms.json").read_text())

@@ -8,8 +8,8 @@ import pytest
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
-from stages.init import known_teeth
 from stages.init.config import InitConfig
+from stages.init.dental import place_known
 from stages.init.stage import InitStage
 from tests.stages.test_init_teeth import FOCAL, SIZE, found_teeth, read_teeth, side_pose
 from tests.teeth_case import write
@@ -65,7 +65,7 @@ def run(tmp_path, monkeypatch, path, found, likely=True, **settings):
     def sweep(*_, **__):
         raise ReconstructionError("the sweep was asked")
 
-    monkeypatch.setattr(known_teeth, "reconstruct_teeth", reconstruct)
+    monkeypatch.setattr(place_known, "reconstruct_teeth", reconstruct)
     monkeypatch.setattr("stages.init.place.place_known", sweep)
     config = InitConfig(cameras=str(path), **settings)
     inputs = {"views": photographs()} | ({"teeth": read_teeth()} if likely else {})

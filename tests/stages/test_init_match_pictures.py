@@ -7,8 +7,7 @@ import numpy as np
 from pipeline.artifacts.views import View
 from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
-from stages.init.geometry import Correspondences
-from stages.init.match_pictures import (
+from stages.init.sfm.matching.pictures import (
     DIMMED,
     GAP,
     LONG_SIDE,
@@ -17,6 +16,7 @@ from stages.init.match_pictures import (
     match_table,
     pairs_to_draw,
 )
+from stages.init.sfm.matching.two_view import Correspondences
 from stages.init.write import save_matches
 
 

@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from stages.init.features import Features, detect_features, merge_points, squeezed
-from stages.init.matching import candidate_pairs, match_features, overlap_counts, select_pairs
+from stages.init.sfm.matching.features import Features, detect_features, merge_points, squeezed
+from stages.init.sfm.matching.match import (
+    candidate_pairs,
+    match_features,
+    overlap_counts,
+    select_pairs,
+)
 
 
 def make_features(positions, descriptors):
@@ -62,7 +67,7 @@ def test_matches_do_not_depend_on_block_or_blas_threads(monkeypatch):
     expected = match_features(first, second)
     with threadpool_limits(1, "blas"):
         np.testing.assert_array_equal(match_features(first, second), expected)
-    monkeypatch.setattr("stages.init.matching.BLOCK_ROWS", 37)
+    monkeypatch.setattr("stages.init.sfm.matching.match.BLOCK_ROWS", 37)
     np.testing.assert_array_equal(match_features(first, second), expected)
 
 

@@ -13,7 +13,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from stages.align.stage import AlignConfig, AlignStage
-from stages.init.geometry import angle_between
+from stages.init.sfm.matching.two_view import angle_between
 from stages.init.stage import InitConfig, InitStage
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
@@ -109,12 +109,12 @@ def test_which_model_is_asked(monkeypatch, tmp_path):
     weights = tmp_path / "weights.pth"
     weights.write_bytes(b"x")
     config = InitConfig(pointmap={"checkpoint": str(weights)})
-    monkeypatch.setattr("stages.init.pointmap.predict.available", lambda: ["vggt", "dust3r"])
+    monkeypatch.setattr("stages.pointmaps.predict.available", lambda: ["vggt", "dust3r"])
     with pytest.raises(RequestError, match=r"Several .*init\.method=vggt"):
         InitStage().sources(config, {})
-    monkeypatch.setattr("stages.init.pointmap.predict.available", lambda: ["dust3r"])
+    monkeypatch.setattr("stages.pointmaps.predict.available", lambda: ["dust3r"])
     assert InitStage().sources(config, {}) == {"checkpoint": weights}
-    monkeypatch.setattr("stages.init.pointmap.predict.available", list)
+    monkeypatch.setattr("stages.pointmaps.predict.available", list)
     assert InitStage().sources(config, {}) == {}
     with pytest.raises(RequestError, match="would not use it"):
         InitStage().sources(InitConfig(method="dust3r", cameras="x"), {})

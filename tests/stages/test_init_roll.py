@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.init.features import detect_features, turned_back
-from stages.init.geometry import unrolled
-from stages.init.matching import match_features
-from stages.init.roll import find_rolls, groups, relative_roll
+from stages.init.sfm.matching.features import detect_features, turned_back
+from stages.init.sfm.matching.match import match_features
+from stages.init.sfm.matching.roll import find_rolls, groups, relative_roll
+from stages.init.sfm.matching.two_view import unrolled
 
 
 def texture(seed=0, size=(200, 260)):

@@ -11,11 +11,11 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
+from pipeline.geometry import cloud
 from pipeline.stage import LocalContext
-from stages.init import cloud
-from stages.init.classical import Evidence, group_lenses
-from stages.init.diagnosis import least_views, standing_still
-from stages.init.geometry import angle_between
+from stages.init.sfm.diagnosis import least_views, standing_still
+from stages.init.sfm.matching.two_view import angle_between
+from stages.init.sfm.reconstruct import Evidence, group_lenses
 from stages.init.stage import InitConfig, InitStage
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -11,8 +11,8 @@ from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
-from stages.init import teeth
 from stages.init.config import DentalConfig, InitConfig
+from stages.init.dental import place
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.reconstruct import Reconstruction, with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
@@ -143,7 +143,7 @@ def run(
         shown = [view.mirrored() if k in over else view for k, view in enumerate(views)]
         return replace(found, views=shown, mirrored=tuple(over))
 
-    monkeypatch.setattr(teeth, "reconstruct_teeth", reconstruct)
+    monkeypatch.setattr(place, "reconstruct_teeth", reconstruct)
     config = InitConfig(method="dental", dental=dental, length=length or {})
     inputs = {"views": photographs(), "teeth": read or read_teeth()}
     tmp_path.mkdir(exist_ok=True)
@@ -266,7 +266,7 @@ def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path
         config = InitConfig(method="dental", dental={"labels": labels})
         inputs = {"views": views, "teeth": read_teeth()}
         context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
-        return teeth.labelled_teeth(context, views)
+        return place.labelled_teeth(context, views)
 
     (crown,) = [c for c in said().views[0].all_crowns if c.doubt == 0]
     assert (crown.number, crown.jaw) == (14, "upper")
@@ -333,12 +333,12 @@ def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypat
 
 def test_settings_reach_the_fit():
     views = photographs()
-    options = teeth.arch_options(DentalConfig(order="right, frontal,left", min_margin=21), views)
+    options = place.arch_options(DentalConfig(order="right, frontal,left", min_margin=21), views)
     assert options.order == ("right", "frontal", "left")
     assert options.min_margin == 21
     with pytest.raises(RequestError, match="names 2 photographs"):
-        teeth.arch_options(DentalConfig(order="right,left"), views)
-    assert teeth.surface_options(DentalConfig(gum_height=2)).gum_height == 2
+        place.arch_options(DentalConfig(order="right,left"), views)
+    assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2
 
 
 @pytest.fixture
@@ -360,7 +360,9 @@ def auto(tmp_path, count, read=None, sources=None, **config):
 
 def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch, no_features):
     tried = []
-    monkeypatch.setattr("stages.init.teeth.from_teeth", lambda context, views: tried.append(1))
+    monkeypatch.setattr(
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
+    )
     none = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], "none") for k in range(3)))
     refused = [
         ("unread", 3, None, {}),
@@ -383,7 +385,9 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
     tmp_path, monkeypatch, no_features
 ):
     tried = []
-    monkeypatch.setattr("stages.init.teeth.from_teeth", lambda context, views: tried.append(1))
+    monkeypatch.setattr(
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
+    )
     read = read_teeth(aside=(0,))
     with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
         auto(tmp_path / "a", 3, read)
@@ -400,7 +404,7 @@ def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypat
     def doubtful(context, views):
         raise ReconstructionError("Photo 1 and 2 hardly agree.", picture, read)
 
-    monkeypatch.setattr("stages.init.teeth.from_teeth", doubtful)
+    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
     with pytest.raises(ReconstructionError, match=r"could be placed.*hardly agree") as caught:
         auto(tmp_path, 3, read_teeth())
     assert caught.value.pictures == picture

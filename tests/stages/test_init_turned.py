@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.artifacts.teeth import Crown, Dentition
 from pipeline.artifacts.views import View
-from stages.geometry.crowns import mirrored_dentition
+from stages.dentition.crowns import mirrored_dentition
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.turned import Turned, fit_turned, says_side, turnings
 

@@ -6,11 +6,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stages.init.geometry import Correspondences, coherent_matches
-from stages.init.options import ClassicalOptions, RefinementOptions
-from stages.init.refine import refine_solution, robust_cost
-from stages.init.solver import Solver, unknown_focal
-from stages.init.undistort import distort_pixels, undistort_image, undistort_pixels
+from stages.init.sfm.matching.two_view import Correspondences, coherent_matches
+from stages.init.sfm.options import ClassicalOptions, RefinementOptions
+from stages.init.sfm.refine import refine_solution, robust_cost
+from stages.init.sfm.solver import Solver, unknown_focal
+from stages.init.sfm.undistort import distort_pixels, undistort_image, undistort_pixels
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, worst_rotation
 
 SIZE = (WIDTH, HEIGHT)

@@ -10,8 +10,8 @@ import pytest
 from pipeline.artifacts.pointmaps import PointmapPair, write_pair
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.init.pointmap.options import PointmapOptions
-from stages.init.pointmap.predict import predict_pointmaps, source_files
+from stages.pointmaps.options import PointmapOptions
+from stages.pointmaps.predict import predict_pointmaps, source_files
 
 SIZE = (12, 16)
 

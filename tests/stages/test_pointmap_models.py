@@ -13,17 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.init.pointmap.loading import NoNetworkError, choose_device, import_module, offline
-from stages.init.pointmap.memory import check_memory, needed_gb
-from stages.init.pointmap.options import MODELS, PointmapOptions
-from stages.init.pointmap.predict import (
+from stages.pointmaps.loading import NoNetworkError, choose_device, import_module, offline
+from stages.pointmaps.memory import check_memory, needed_gb
+from stages.pointmaps.options import MODELS, PointmapOptions
+from stages.pointmaps.predict import (
     adapter,
     available,
     cards,
     predict_pointmaps,
     source_files,
 )
-from stages.init.pointmap.quick_start import quick_start
+from stages.pointmaps.quick_start import quick_start
 from tests.stages import pointmap_models as stand_in
 
 ANGLES = (-20.0, -4.0, 12.0)

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.init.pointmap.graph import choose_graph, scene_pairs
-from stages.init.pointmap.mapanything import SHAPES
-from stages.init.pointmap.prepare import (
+from stages.pointmaps.graph import choose_graph, scene_pairs
+from stages.pointmaps.mapanything import SHAPES
+from stages.pointmaps.prepare import (
     clean_map,
     fixed_width,
     multiple_of_patch,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.teeth import Dentition
-from stages.geometry.crowns import dentition_of
-from stages.geometry.tooth_rows import ChainOptions
+from stages.dentition.crowns import dentition_of
+from stages.dentition.tooth_rows import ChainOptions
 from stages.teeth.choose import ChoiceOptions, choose, chroma, layout_distance
 from stages.teeth.read import Reading, numbered, row_extent
 from tests.stages.test_teeth_crowns import SIZE, mouth

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.artifacts.fdi import Jaw
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.geometry.crowns import (
+from stages.dentition.crowns import (
     NATURAL_TILT,
     ZENITH_FLATNESS,
     Outline,

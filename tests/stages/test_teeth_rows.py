@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.fdi import teeth_of
-from stages.geometry.tooth_rows import (
+from stages.dentition.tooth_rows import (
     NO_TOOTH,
     POSITIONS,
     ChainOptions,

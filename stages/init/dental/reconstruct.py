@@ -12,7 +12,7 @@ from pipeline.artifacts.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
-from stages.geometry.teeth_overlay import labelled_overlay, sheet
+from stages.dentition.overlay import labelled_overlay, sheet
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.pictures.turned import turned_sheet

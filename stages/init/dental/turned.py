@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
-from stages.geometry.crowns import mirrored_dentition
+from stages.dentition.crowns import mirrored_dentition
 from stages.init.dental.solution import ArchFit
 
 #: Places the photographs, with their teeth.

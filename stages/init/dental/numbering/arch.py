@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pipeline.artifacts.fdi import JAWS, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
-from stages.geometry.tooth_rows import NO_TOOTH, Labels
+from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import view_angles
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
 from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo

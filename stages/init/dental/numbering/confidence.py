@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from stages.geometry.tooth_rows import NO_TOOTH
+from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.geometry.tooth_rows import NO_TOOTH, Labels
+from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted
 from stages.init.dental.numbering.sightings import SeenRow
 from stages.init.dental.template import PAPILLA, POSITIONS, landmark_index

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.fdi import is_upper
-from stages.geometry.tooth_rows import NO_TOOTH, Labels, best_rows
+from stages.dentition.tooth_rows import NO_TOOTH, Labels, best_rows
 from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
 from stages.init.dental.cameras.held import HeldCameras
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW

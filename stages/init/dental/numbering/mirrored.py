@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pipeline.artifacts.teeth import Dentition
-from stages.geometry.crowns import mirrored_dentition
-from stages.geometry.tooth_rows import NO_TOOTH
+from stages.dentition.crowns import mirrored_dentition
+from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.hypotheses import (
     Labelling,
     Scored,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Point
-from stages.geometry.tooth_rows import NO_TOOTH, ChainOptions, Labels, position_evidence
+from stages.dentition.tooth_rows import NO_TOOTH, ChainOptions, Labels, position_evidence
 from stages.init.dental.cameras.bundle import Sightings
 from stages.init.dental.template import (
     EMBRASURE,

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
-from stages.init.dense.appearance import highlights
 from stages.init.dental.solution import PlacedView
+from stages.stereo.appearance import highlights
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from stages.init.dense.aggregate import aggregate, decide, edge_aware_penalty
 from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import Photo
+from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

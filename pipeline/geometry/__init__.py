@@ -1,0 +1,1 @@
+"""The geometry that artifacts, stages and reports share: arrays in, arrays out."""

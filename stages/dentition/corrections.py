@@ -1,0 +1,201 @@
+"""What a person put right about the teeth, applied to what was read from the photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.corrections import Corrections, CrownCorrection, PhotoCorrection, Place
+from pipeline.artifacts.fdi import Jaw, is_upper
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import RequestError, nearest
+from stages.dentition.crowns import dentition_of, mirrored_dentition, outline_of
+
+Array = npt.NDArray[np.float64]
+
+#: Why a photograph that the user leaves out is set aside.
+LEFT_OUT = "left out by hand"
+#: A line that leaves less than this share of a crown on one side doesn't part it.
+LEAST_PART = 0.03
+
+
+def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> Teeth:
+    """The teeth with what a person said put in place.
+
+    A number that a person gave has doubt 0. The two parts of a crown that was split have none until
+    they are given one. Landmarks are computed again where crowns went, came or changed jaw.
+
+    Args:
+        teeth: as read from the photographs.
+        views: the photographs that they were read from.
+        corrections: what to change.
+
+    Returns:
+        The teeth without pictures, for those would show what was; unchanged where there is nothing
+        to correct. Those of mirror images are of the pictures turned over.
+
+    Raises:
+        RequestError: a photograph or a crown that isn't there; the message names it.
+    """
+    if not corrections:
+        return teeth
+    wanted = _by_view(views, corrections)
+    by_name = views.by_name()
+    corrected = []
+    for dentition in teeth.views:
+        if dentition.name in wanted:
+            label, photo = wanted[dentition.name]
+            where = f"{corrections.file}, photograph '{label}'"
+            dentition = _corrected(dentition, by_name[dentition.name], photo, where)
+        corrected.append(dentition)
+    return Teeth(tuple(corrected))
+
+
+def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, PhotoCorrection]]:
+    """View name -> (what the user calls it, its corrections)."""
+    names = {view.name: view.name for view in views.views}
+    # A stem that two photographs share names neither.
+    stems = [view.source_name.rpartition(".")[0] for view in views.views]
+    names |= {
+        stem: view.name for stem, view in zip(stems, views.views, strict=True)
+        if stem and stems.count(stem) == 1
+    }  # fmt: skip
+    names |= {view.source_name: view.name for view in views.views if view.source_name}
+    found: dict[str, tuple[str, PhotoCorrection]] = {}
+    for label, photo in corrections.photographs.items():
+        if label not in names:
+            sources = [view.source_name or view.name for view in views.views]
+            raise RequestError(
+                f"{corrections.file}: there is no photograph '{label}'.{nearest(label, names)} The "
+                f"photographs are {', '.join(sources)}."
+            )
+        if names[label] in found:
+            raise RequestError(
+                f"{corrections.file}: '{found[names[label]][0]}' and '{label}' are the same "
+                "photograph; say it once."
+            )
+        found[names[label]] = label, photo
+    return found
+
+
+def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: str) -> Dentition:
+    mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
+    if dentition.mirrored:  # places are pixels of the photograph as it was taken
+        dentition = mirrored_dentition(dentition)
+    crowns = list(dentition.all_crowns)
+    moved = False
+    for k, change in enumerate(photo.crowns):
+        index = _crown_at(
+            crowns, working_place(view, change.at), change.at, f"{where}, crowns[{k}]"
+        )
+        moved |= _change(crowns, index, change, view, f"{where}, crowns[{k}]")
+    kind = photo.kind or dentition.kind
+    set_aside = dentition.set_aside
+    if photo.use is not None:
+        set_aside = "" if photo.use else LEFT_OUT
+    if photo.use and not crowns:
+        raise RequestError(
+            f"{where}: use is true, but no tooth was found in this photograph. Leave it out."
+        )
+    if moved:
+        corrected = dentition_of(
+            [outline_of(crown) for crown in crowns], dentition.name, dentition.size, kind,
+            roll=dentition.roll, set_aside=set_aside, doubts=dentition.doubts,
+        )  # fmt: skip
+    else:
+        corrected = replace(
+            dentition, kind=kind, set_aside=set_aside,
+            upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
+            lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
+        )  # fmt: skip
+    if not mirrored:
+        return replace(corrected, mirrored=mirrored)
+    turned = mirrored_dentition(corrected)
+    return replace(turned, kind=photo.kind or turned.kind)
+
+
+def _change(
+    crowns: list[Crown], index: int, change: CrownCorrection, view: View, where: str
+) -> bool:
+    """Change one crown in place; says whether landmarks have to be found again."""
+    crown = crowns[index]
+    if change.tooth is not None:
+        jaw: Jaw = "upper" if is_upper(change.tooth) else "lower"
+        crowns[index] = replace(crown, number=change.tooth, doubt=0.0, jaw=jaw)
+        return jaw != crown.jaw
+    if change.split is None:
+        del crowns[index]
+        return True
+    start, end = (working_place(view, place) for place in change.split)
+    parts = split_polygon(crown.outline, start, end)
+    areas = [area(part) for part in parts]
+    if min(areas) < LEAST_PART * max(sum(areas), 1e-9):
+        raise RequestError(
+            f"{where}.split: the line doesn't cross the crown at {_said(change.at)}."
+        )
+    crowns[index : index + 1] = [
+        replace(crown, outline=part, number=0, doubt=1.0, numbers={}) for part in parts
+    ]
+    return True
+
+
+def _crown_at(crowns: list[Crown], place: Array, said: Place, where: str) -> int:
+    """The crown under a place, or the nearest one within half its width."""
+    point = (float(place[0]), float(place[1]))
+    inside = [
+        cv2.pointPolygonTest(crown.outline.astype(np.float32)[:, None], point, True)
+        if len(crown.outline) >= 3 else -np.inf
+        for crown in crowns
+    ]  # fmt: skip
+    near = [index for index, distance in enumerate(inside) if -distance <= crowns[index].width / 2]
+    if not near:
+        raise RequestError(
+            f"{where}: there is no crown at {_said(said)}. Open check.html to see where they are."
+        )
+    return max(near, key=lambda index: inside[index])
+
+
+def _said(place: Place) -> str:
+    return f"{place[0]:g}, {place[1]:g}"
+
+
+def working_place(view: View, place: Place) -> Array:
+    """[2] pixel of the view for a pixel of the upright photograph."""
+    width, height = view.upright_size
+    return np.array([place[0] * view.width / width, place[1] * view.height / height])
+
+
+def split_polygon(polygon: Array, start: Array, end: Array) -> tuple[Array, Array]:
+    """The parts of a polygon [K, 2] on either side of the line through two points.
+
+    Sutherland and Hodgman, Reentrant Polygon Clipping (1974), for each of the two half planes. Of a
+    polygon that the line crosses more than twice, the pieces of a side hang together along it.
+    """
+    across = np.array([start[1] - end[1], end[0] - start[0]])
+    height = (polygon - start) @ across
+    return _clipped(polygon, height), _clipped(polygon, -height)
+
+
+def _clipped(polygon: Array, height: Array) -> Array:
+    """The part of a polygon where a linear function, given at its corners, is not negative."""
+    kept = []
+    for k in range(len(polygon)):
+        before, now = height[k - 1], height[k]
+        if (before < 0) != (now < 0):
+            share = before / (before - now)
+            kept.append(polygon[k - 1] + share * (polygon[k] - polygon[k - 1]))
+        if now >= 0:
+            kept.append(polygon[k])
+    return np.array(kept).reshape(-1, 2)
+
+
+def area(polygon: Array) -> float:
+    """Square pixels inside a polygon [K, 2]."""
+    if len(polygon) < 3:
+        return 0.0
+    x, y = polygon.T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)

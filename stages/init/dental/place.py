@@ -1,0 +1,252 @@
+"""From the dental path's result to what the stage writes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.corrections import (
+    CORRECTIONS,
+    Corrections,
+    CrownCorrection,
+    PhotoCorrection,
+    read_corrections,
+)
+from pipeline.artifacts.pictures import Pictures
+from pipeline.artifacts.points import Points
+from pipeline.artifacts.teeth import Dentition
+from pipeline.artifacts.teeth import Teeth as TeethArtifact
+from pipeline.artifacts.views import View, Views
+from pipeline.errors import ReconstructionError, RequestError
+from pipeline.geometry import cloud
+from pipeline.geometry.graph import Pair
+from pipeline.stage import StageContext
+from stages.dentition.corrections import apply_corrections
+from stages.init.config import DentalConfig, InitConfig
+from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
+from stages.init.dental.scale import scale_from_widths
+from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.place import photo_name, with_focals
+from stages.init.placement import Placement
+from stages.init.write import save_all
+
+Map = npt.NDArray[np.float32]
+
+
+def from_teeth(context: StageContext, views: Views) -> None:
+    """Place the views by their teeth, and write what came out.
+
+    Raises:
+        ReconstructionError: no teeth, or a doubtful result, with labelled pictures.
+        RequestError: the settings of `init.dental` don't fit the photographs.
+    """
+    config: InitConfig = context.config
+    read = labelled_teeth(context, views)
+    said = {dentition.name for dentition in read.views if dentition.mirrored}
+    given = views
+    views = replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
+    dentitions = chosen_dentitions(read, views)
+    if config.dental.order is not None:
+        dentitions = [d or e for d, e in zip(dentitions, read.views, strict=True)]
+    names = [photo_name(view) for view in views.views]
+    try:
+        teeth = reconstruct_teeth(
+            list(views.views), names, dentitions, with_focals(views.views, config.focal),
+            arch_options(config.dental, views), surface_options(config.dental),
+            accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
+            progress=context.progress,
+        )  # fmt: skip
+    except ReconstructionError as doubtful:
+        numbered = doubtful.artifacts.get("teeth")
+        if isinstance(numbered, TeethArtifact):
+            doubtful.artifacts["teeth"] = updated(read, numbered.views)
+        raise
+    for doubt in (*teeth.fit.doubts, *turned_back(names, teeth), *misnamed(names, teeth)):
+        context.warn(doubt)
+    context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
+    _write(context, given, teeth)
+
+
+def labelled_teeth(context: StageContext, views: Views) -> TeethArtifact:
+    """The teeth that were read from the photographs, with what a person has said of them.
+
+    Raises:
+        RequestError: the stage `teeth` has not run, or what was said fits no crown.
+    """
+    if not context.has("teeth"):
+        raise RequestError(
+            "The teeth of these photographs have not been read. Name the stage `teeth` before "
+            "`init`, as in --stages teeth,init."
+        )
+    read: TeethArtifact = context.load("teeth")
+    for label, path in context.sources.items():
+        if label == CORRECTIONS:
+            read = apply_corrections(read, views, read_corrections(path))
+    said = context.config.dental.labels
+    if not isinstance(said, str) and said:
+        photographs: dict[str, PhotoCorrection] = {}
+        for hint in said:
+            before = photographs.get(hint.photo, PhotoCorrection())
+            crown = CrownCorrection((hint.x, hint.y), hint.tooth)
+            photographs[hint.photo] = replace(before, crowns=(*before.crowns, crown))
+        read = apply_corrections(read, views, Corrections(photographs, "init.dental.labels"))
+    return read
+
+
+def chosen_dentitions(read: TeethArtifact, views: Views) -> list[Dentition | None]:
+    """View by view its crowns, None where it takes no part."""
+    chosen = {dentition.name: dentition for dentition in read.chosen}
+    return [chosen.get(view.name) for view in views.views]
+
+
+def updated(read: TeethArtifact, numbered: Iterable[Dentition]) -> TeethArtifact:
+    """The teeth with some photographs' numbers replaced."""
+    new = {dentition.name: dentition for dentition in numbered}
+    return replace(read, views=tuple(new.get(view.name, view) for view in read.views), pictures={})
+
+
+def turned_back(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of photographs that were mirror images."""
+    return [
+        f"{names[k]} is a mirror image: the patient's right is on its left where the other "
+        "photographs have it on theirs. It was turned over."
+        for k in teeth.mirrored
+    ]
+
+
+def misnamed(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of photographs whose names call them the other side than their teeth show."""
+    other = {"right": "left", "left": "right"}
+    return [
+        f"{name} shows the patient's {placed.role} side by its teeth, although its name says "
+        f"{other[placed.role]}; the teeth are believed."
+        for name, placed in zip(names, teeth.fit.views, strict=True)
+        if placed is not None
+        and placed.role in other
+        and other[placed.role] in name.lower()
+        and placed.role not in name.lower()
+    ]
+
+
+def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
+    config: InitConfig = context.config
+    surface = teeth.surface
+    order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
+    mm, uncertainty = scale_from_widths(teeth.fit, config.dental.tooth_widths)
+    mask = config.dental.mask_rest is not False
+    cameras = tuple(_camera(teeth.views[k], teeth, k) for k in order)
+    rolls = [d.roll if (d := teeth.dentitions[k]) else 0.0 for k in order]
+    downs = [
+        np.array([-np.sin(r), np.cos(r), 0]) @ c.rotation
+        for r, c in zip(rolls, cameras, strict=True)
+    ]
+    placement = Placement(
+        views=tuple(_masked(teeth.views[k], teeth, k, mask) for k in order),
+        cameras=cameras,
+        points=surface.positions.astype(np.float64), seen=(), weights={},
+        input_from_world=np.diag([mm, mm, mm, 1.0]), units="mm",
+    ).normalised(downs)  # fmt: skip
+    scale = mm / np.cbrt(np.linalg.det(placement.input_from_world[:3, :3]))
+    world_from_mm = np.linalg.inv(placement.input_from_world) @ np.diag([mm, mm, mm, 1.0])
+    rotation = world_from_mm[:3, :3] / scale
+    maps = [surface.views[k] for k in order]
+    depths = [(found.depth * scale).astype(np.float32) for found in maps if found]
+    confidences = [found.confidence for found in maps if found]
+    points = Points(
+        positions=placement.points.astype(np.float32),
+        colors=surface.colors,
+        normals=(surface.normals @ rotation.T).astype(np.float32),
+        confidence=surface.confidence,
+        scale=np.full(len(surface.positions), config.dental.cloud_spacing * scale, np.float32),
+    )
+    cameras = placement.cameras
+    pairs = [
+        cloud.pointmap_pair(
+            cameras[i], cameras[j], depths[i], depths[j], confidences[i], confidences[j]
+        )
+        for i, j in neighbours(cameras)
+    ]
+    save_all(
+        context, views, placement.views,
+        Cameras(cameras, placement.input_from_world, "mm"), depths, points, pairs,
+    )  # fmt: skip
+    context.save(Pictures(teeth.pictures))
+    context.summarize(
+        method="dental", **tooth_counts(teeth),
+        scale_uncertainty_percent=round(100 * uncertainty, 1),
+    )  # fmt: skip
+    if config.length.mm is None and not config.dental.tooth_widths:
+        context.warn(
+            f"Millimetres come from textbook teeth and may be {100 * uncertainty:.0f} % off; pass "
+            "a known width, as in --set 'init.dental.tooth_widths={11: 8.6}', for a true scale."
+        )
+
+
+def _camera(view: View, teeth: Reconstruction, number: int) -> Camera:
+    placed = teeth.fit.views[number]
+    assert placed is not None
+    return Camera(
+        view.name, view.width, view.height, placed.focal, placed.focal,
+        view.width / 2, view.height / 2, placed.cam_from_world,
+    )  # fmt: skip
+
+
+def _masked(view: View, teeth: Reconstruction, number: int, mask_rest: bool) -> View:
+    """The view with what is not teeth or gum masked out."""
+    found = teeth.surface.views[number]
+    if not mask_rest or found is None:
+        return view
+    return masked(view, found.depth)
+
+
+def masked(view: View, depth: Map) -> View:
+    """The view with what has no depth masked out."""
+    return replace(view, mask=(depth > 0) & view.valid())
+
+
+def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
+    """Figures of the teeth found, for the summary."""
+    placed = [view for view in teeth.fit.views if view is not None]
+    return {
+        "upper_teeth": len({tooth for view in placed for tooth in view.upper if tooth}),
+        "lower_teeth": len({tooth for view in placed for tooth in view.lower if tooth}),
+        "label_margin": round(teeth.fit.margin, 1),
+        "teeth_confidence": round(teeth.fit.confidence, 3),
+        "landmark_error_px": round(float(np.median([view.error for view in placed])), 2),
+    }
+
+
+def neighbours(cameras: tuple[Camera, ...]) -> list[Pair]:
+    """Each camera with the next one around the arch, as pairs of positions."""
+    sideways = [camera.centre[0] for camera in cameras]
+    around = sorted(range(len(cameras)), key=lambda number: (sideways[number], number))
+    return sorted((min(i, j), max(i, j)) for i, j in pairwise(around))
+
+
+def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
+    """The settings of the arch fit.
+
+    Raises:
+        RequestError: an order that doesn't fit the photographs.
+    """
+    if config.order is not None and len(config.order) != len(views):
+        raise RequestError(
+            f"init.dental.order names {len(config.order)} photographs "
+            f"({','.join(config.order)}), but there are {len(views)}."
+        )
+    shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
+    settings = {name: getattr(config, name) for name in sorted(shared)}
+    return ArchOptions(**settings)
+
+
+def surface_options(config: DentalConfig) -> SurfaceOptions:
+    """The settings of the dense surface."""
+    shared = set(DentalConfig.model_fields) & set(SurfaceOptions.__dataclass_fields__)
+    settings = {name: getattr(config, name) for name in sorted(shared)}
+    return SurfaceOptions(**{name: value for name, value in settings.items() if value is not None})

@@ -1,0 +1,270 @@
+"""Saying what is wrong with the photographs, and what to do about it, to the one who took them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.graph import Pair
+from stages.init.sfm.mapping import Solution
+from stages.init.sfm.matching.roll import groups
+from stages.init.sfm.matching.two_view import angle_between
+from stages.init.sfm.reconstruct import Attempt, Evidence
+
+#: Advice that helps in nearly all cases.
+HOW_TO_SHOOT = (
+    "Take photographs from different sides of the teeth, neighbouring ones turned by no more than "
+    "20 degrees against each other, all sharp and with the same zoom, and move the camera rather "
+    "than turning it on the spot."
+)
+
+
+HOW_TO_BRIDGE = (
+    "Add a photograph between them, turned no more than 20 degrees against either, sharp and with "
+    "the same zoom (or take a short video that sweeps around)."
+)
+HOW_TO_GIVE_FOCAL = (
+    "Keep the EXIF data of the photographs, or pass the focal length over the long side of the "
+    "image, if you know it, as in --set init.focal=1.2."
+)
+#: Photographs of teeth that are turned by no more than this against each other, in degrees, are
+#: linked; those from 40 on hardly ever (see `TwoView.evidence`).
+LINKED_UP_TO = 35
+#: A photograph with less than this share of the spots that the others show is a bad one.
+BLURRED = 0.4
+#: Gaps and photographs that are explained one by one.
+MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a reconstruction must keep to be believed.
+
+    Attributes:
+        min_views: least number of views.
+        min_tri_angle: degrees, of the median point.
+        min_baseline: largest distance between two cameras over the median depth.
+        min_points: points that each view must observe.
+        max_error: root mean square reprojection error in pixels.
+        max_turn: degrees by which the cameras may contradict the pairs that link them.
+        max_flat: share of a pair's matches that one homography may explain.
+    """
+
+    min_views: int
+    max_error: float
+    min_tri_angle: float = 1.5
+    min_baseline: float = 0.02
+    min_points: int = 12
+    max_turn: float = 10.0
+    max_flat: float = 0.9
+
+
+def least_views(count: int, fraction: float) -> int:
+    """How many of `count` views must be placed: all of up to 3, else the fraction, at least 2."""
+    return count if count <= 3 else max(2, int(np.ceil(fraction * count)))
+
+
+def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
+    """The diagnosis of an attempt as one paragraph, or None if the reconstruction is good.
+
+    Args:
+        names: how the user knows the photographs.
+    """
+    if len(names) < 2:
+        return (
+            f"One photograph ({', '.join(names)}) can't give a 3D scene: at least two are needed, "
+            f"three or more are better. {HOW_TO_SHOOT}"
+        )
+    evidence, solution = attempt.evidence, attempt.solution
+    blank = [names[view] for view, count in enumerate(evidence.keypoints) if count < 50]
+    if blank and (solution is None or len(solution.poses) < limits.min_views):
+        return (
+            f"There is too little to recognise in {_listed(blank)} (fewer than 50 distinct "
+            "spots): the photograph is blurred, too dark, too bright, or its mask covers it. "
+            "Leave it out or take it again."
+        )
+    still = standing_still(evidence, len(names))
+    if still:
+        return still
+    if solution is None:
+        return (
+            "No two photographs could be placed against each other. "
+            f"{_gaps(evidence, names)} {_advice(attempt)}"
+        )
+    doubt = doubtful(solution, evidence, limits)
+    if doubt:
+        return f"{doubt} {HOW_TO_SHOOT}"
+    if len(solution.poses) < limits.min_views:
+        unplaced = [view for view in range(len(names)) if view not in solution.poses]
+        reasons = " ".join(
+            _why_unplaced(evidence, names, view, set(solution.poses))
+            for view in unplaced[:MOST_NAMED]
+        )
+        return (
+            f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
+            f"{limits.min_views} are needed. Not placed: "
+            f"{_listed([names[view] for view in unplaced])}. {reasons} {_advice(attempt)}"
+        )
+    return None
+
+
+def standing_still(evidence: Evidence, count: int) -> str | None:
+    """The diagnosis if no pair of photographs shows any movement, else None."""
+    strong = [pair for pair, edge in evidence.edges.items() if edge.evidence >= 25]
+    if not strong:
+        return None
+    linked = {view for pair in strong for view in pair}
+    if len(linked) == count and all(evidence.displacement[pair] < 1.5 for pair in strong):
+        return (
+            "The camera did not move between the photographs: they are the same, or nearly, "
+            f"so that there is no depth to see. {HOW_TO_SHOOT}"
+        )
+    return None
+
+
+def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | None:
+    """Why a reconstruction can't be believed, or None. Small residuals alone prove nothing."""
+    if evidence.flat > limits.max_flat:
+        return (
+            "The photographs show no depth: "
+            f"{100 * evidence.flat:.0f} % of what they share moves as if painted on a flat board. "
+            "The camera was turned on the spot, or what it saw is flat."
+        )
+    angle = float(np.median(solution.triangulation_angles())) if len(solution.points) else 0.0
+    centres = solution.centres()
+    baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
+    depth = _median_depth(solution)
+    if angle < limits.min_tri_angle or depth <= 0 or baseline < limits.min_baseline * depth:
+        return (
+            "The photographs were taken from nearly the same spot (the rays to the same points "
+            f"differ by {angle:.1f} degrees), which gives no depth."
+        )
+    if solution.error > limits.max_error:
+        return (
+            f"The photographs contradict each other: points miss their place by "
+            f"{solution.error:.1f} pixels. Something moved between them, or the zoom changed."
+        )
+    bare = [view for view in solution.poses if len(solution.points_of(view)) < limits.min_points]
+    linked = [evidence.edges[pair] for pair in solution.edges if pair in evidence.edges]
+    turned = [
+        _turn(solution, pair, evidence)
+        for pair in solution.edges
+        if pair in evidence.edges and {*pair} <= set(solution.poses)
+    ]
+    if bare or not linked or (turned and np.median(turned) > limits.max_turn):
+        return "The photographs could be placed only by coincidence: too few points agree on it."
+    return None
+
+
+def _turn(solution: Solution, pair: Pair, evidence: Evidence) -> float:
+    i, j = pair
+    turn = solution.poses[j][:3, :3] @ solution.poses[i][:3, :3].T
+    return angle_between(turn, evidence.edges[pair].rotation)
+
+
+def _median_depth(solution: Solution) -> float:
+    depths = [solution.points @ pose[2, :3] + pose[2, 3] for pose in solution.poses.values()]
+    return float(np.median(np.concatenate(depths))) if depths else 0.0
+
+
+def warnings_of(attempt: Attempt, names: list[str]) -> list[str]:
+    """What the user should know of a reconstruction that stands: views left out, and a guess.
+
+    Args:
+        names: how the user knows the photographs.
+    """
+    solution = attempt.solution
+    if solution is None:
+        return []
+    unplaced = [view for view in range(len(names)) if view not in solution.poses]
+    result = []
+    if unplaced:
+        reasons = " ".join(_why_unplaced(attempt.evidence, names, view, set(solution.poses))
+                           for view in unplaced[:MOST_NAMED])  # fmt: skip
+        result.append(
+            f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
+            f"{_listed([names[view] for view in unplaced])}. {reasons} {HOW_TO_BRIDGE}"
+        )
+    if not attempt.focal_determined:
+        few = " Two photographs fit nearly any." if len(solution.poses) < 3 else ""
+        result.append(f"The focal length is undetermined: it is a guess.{few} {HOW_TO_GIVE_FOCAL}")
+    return result
+
+
+def _why_unplaced(evidence: Evidence, names: list[str], view: int, placed: set[int]) -> str:
+    """One sentence: why a photograph could not be placed beside those that are."""
+    usual = float(np.median(evidence.keypoints))
+    if evidence.keypoints[view] < BLURRED * usual:
+        return (
+            f"'{names[view]}' shows only {evidence.keypoints[view]} distinct spots where the "
+            f"others show {usual:.0f}: it is blurred, too dark, too bright or mostly masked."
+        )
+    pair = _best_pair(evidence, [pair for pair in evidence.matches
+                                 if view in pair and ({*pair} - {view}) & placed])  # fmt: skip
+    if pair is None:
+        return f"'{names[view]}' resembles none of the placed ones."
+    if pair in evidence.linked:
+        other = names[pair[0] if pair[1] == view else pair[1]]
+        agreeing = len(evidence.edges[pair].inliers)
+        return (
+            f"'{names[view]}' matches '{other}' ({agreeing} spots agree), but contradicts the "
+            "other photographs: something moved, or the zoom changed."
+        )
+    return _link(evidence, names, pair)
+
+
+def _gaps(evidence: Evidence, names: list[str]) -> str:
+    """A sentence on each gap that keeps photographs apart: the best of the pairs across it."""
+    group = groups(list(evidence.linked), len(names))
+    sentences: list[str] = []
+    while len(set(group)) > 1 and len(sentences) < MOST_NAMED:
+        across = [pair for pair in evidence.matches if group[pair[0]] != group[pair[1]]]
+        pair = _best_pair(evidence, across)
+        if pair is None:
+            lone = [names[view] for view in range(len(names)) if group[view] != group[0]]
+            sentences.append(f"{_listed(lone)} resemble none of the others.")
+            break
+        sentences.append(_link(evidence, names, pair))
+        old, new = group[pair[1]], group[pair[0]]
+        group = [new if number == old else number for number in group]
+    if sentences:
+        return " ".join(sentences)
+    return (
+        "All photographs are linked by matches, but these contradict each other: something moved "
+        "between them, or the zoom changed."
+    )
+
+
+def _best_pair(evidence: Evidence, pairs: list[Pair]) -> Pair | None:
+    """The pair that comes nearest to a link."""
+
+    def strength(pair: Pair) -> tuple[float, int]:
+        edge = evidence.edges.get(pair)
+        return (edge.evidence if edge else 0.0, evidence.matches[pair])
+
+    return min(
+        pairs, key=lambda pair: (tuple(-value for value in strength(pair)), pair), default=None
+    )  # fmt: skip
+
+
+def _link(evidence: Evidence, names: list[str], pair: Pair) -> str:
+    """What a pair that does not link has, and how far apart it must be for that."""
+    matches = evidence.matches[pair]
+    edge = evidence.edges.get(pair)
+    agreeing = len(edge.inliers) if edge else 0
+    share = 100 * agreeing / max(matches, 1)
+    return (
+        f"'{names[pair[0]]}' and '{names[pair[1]]}' share too little: {matches} spots look alike, "
+        f"of which {agreeing} ({share:.0f} %) agree on where the camera stood. They are probably "
+        f"more than {LINKED_UP_TO} degrees apart."
+    )
+
+
+def _advice(attempt: Attempt) -> str:
+    return HOW_TO_BRIDGE if attempt.focal_known else f"{HOW_TO_BRIDGE} {HOW_TO_GIVE_FOCAL}"
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:6])
+    return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more"

@@ -1,0 +1,210 @@
+"""Keypoints that survive a turned camera: upright SIFT on the image and on squeezed copies of it.
+
+Seen from the side, a tooth looks narrower. Describing copies of the image that are squeezed
+horizontally simulates that one rotation, which is what changes along a dental arch, at a third of
+the cost of full affine simulation (Morel & Yu, ASIFT, 2009).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.colmap import quiet_pycolmap
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints and descriptors of one view.
+
+    Attributes:
+        positions: [K, 2] float64 pixels, centres at .5.
+        descriptors: [K, 128] float32 RootSIFT; whole numbers 0..255 with an L2 norm of about 512,
+            so that sums of products are exact in float32 in whatever order they are added.
+        scales: [K] float32, pixels.
+        squeezes: [K] float32, the horizontal squeeze of the copy on which it was found, 1 = none.
+        points: [K] int64, for each the index of the keypoint that stands for its place: keypoints
+            nearer than the merging radius share one.
+        roll: degrees, clockwise, that were taken out of the image before describing it.
+    """
+
+    positions: npt.NDArray[np.float64]
+    descriptors: npt.NDArray[np.float32]
+    scales: npt.NDArray[np.float32]
+    squeezes: npt.NDArray[np.float32]
+    points: npt.NDArray[np.int64]
+    roll: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def largest(self, count: int) -> npt.NDArray[np.int64]:
+        """[<= count] indices of the unsqueezed keypoints of the largest scale, largest first."""
+        plain = np.flatnonzero(self.squeezes == 1)
+        return plain[np.argsort(-self.scales[plain], kind="stable")[:count]]
+
+
+def detect_features(
+    gray: npt.NDArray[np.uint8],
+    valid: npt.NDArray[np.bool_],
+    *,
+    squeezes: tuple[float, ...] = (1.0, 0.71, 0.5),
+    upright: bool = True,
+    peak_threshold: float = 0.002,
+    max_features: int = 6000,
+    merge_radius: float = 1.2,
+    roll: float = 0.0,
+) -> Features:
+    """Detect and describe the keypoints of one view.
+
+    Args:
+        gray: [H, W] uint8.
+        valid: [H, W] bool; keypoints outside are dropped.
+        squeezes: horizontal scales of the copies to describe; 1 is the image itself.
+        upright: take the vertical as the keypoints' orientation (photographs that are not rolled).
+        peak_threshold: contrast below which a keypoint is ignored.
+        max_features: per copy, the largest are kept.
+        merge_radius: pixels within which keypoints count as the same place.
+        roll: degrees by which the photograph is rolled clockwise; it is turned back first.
+    """
+    positions, descriptors, scales, levels = [], [], [], []
+    turned, original_from_turned = turned_back(gray, roll)
+    for squeeze in squeezes:
+        copy = squeezed(turned, squeeze)
+        keypoints, described = _sift(copy, upright, peak_threshold, max_features)
+        place = keypoints[:, :2].astype(np.float64) * (turned.shape[1] / copy.shape[1], 1.0)
+        place = place @ original_from_turned[:, :2].T + original_from_turned[:, 2]
+        within = ((place >= 0) & (place < gray.shape[::-1])).all(1)
+        keypoints, described, place = keypoints[within], described[within], place[within]
+        column = np.clip(place[:, 0].astype(np.int64), 0, gray.shape[1] - 1)
+        row = np.clip(place[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
+        inside = valid[row, column]
+        positions.append(place[inside])
+        descriptors.append(described[inside])
+        scales.append(keypoints[inside, 2])
+        levels.append(np.full(int(inside.sum()), squeeze, np.float32))
+    place = np.concatenate(positions)
+    return Features(
+        positions=place,
+        descriptors=np.concatenate(descriptors),
+        scales=np.concatenate(scales),
+        squeezes=np.concatenate(levels),
+        points=merge_points(place, merge_radius),
+        roll=roll,
+    )
+
+
+def oriented_features(
+    gray: npt.NDArray[np.uint8], valid: npt.NDArray[np.bool_], peak_threshold: float, count: int
+) -> tuple[Features, npt.NDArray[np.float64]]:
+    """Features that don't care how the photograph is rolled, and their orientations.
+
+    Args:
+        gray: [H, W] uint8.
+        valid: [H, W] bool; keypoints outside are dropped.
+        peak_threshold: contrast below which a keypoint is ignored.
+        count: the largest are kept.
+
+    Returns:
+        The features, and [K] radians from the x axis towards the y axis.
+    """
+    keypoints, described = _sift(gray, False, peak_threshold, count)
+    column = np.clip(keypoints[:, 0].astype(np.int64), 0, gray.shape[1] - 1)
+    row = np.clip(keypoints[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
+    inside = valid[row, column]
+    keypoints, described = keypoints[inside], described[inside]
+    features = Features(
+        positions=keypoints[:, :2].astype(np.float64),
+        descriptors=described,
+        scales=keypoints[:, 2],
+        squeezes=np.ones(len(keypoints), np.float32),
+        points=np.arange(len(keypoints)),
+    )
+    return features, keypoints[:, 3].astype(np.float64)
+
+
+def turned_back(
+    gray: npt.NDArray[np.uint8], roll: float
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:
+    """An image without its roll, on a canvas that holds all of it.
+
+    Args:
+        gray: [H, W] uint8.
+        roll: degrees, clockwise.
+
+    Returns:
+        The image, and [2, 3] the map of its pixels (centres at .5) to those of the original.
+    """
+    if not roll:
+        return gray, np.eye(2, 3)
+    cosine, sine = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    turn = np.array([[cosine, -sine], [sine, cosine]])  # original from turned
+    height, width = gray.shape
+    size = np.ceil(np.abs(turn.T) @ (width, height) - 1e-6).astype(int)
+    shift = np.array([width, height]) / 2 - turn @ (size / 2)
+    original_from_turned = np.column_stack([turn, shift])
+    # OpenCV counts pixels from their centres.
+    centred = np.column_stack([turn, shift + turn @ (0.5, 0.5) - 0.5])
+    image = cv2.warpAffine(
+        gray, centred, (int(size[0]), int(size[1])),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.ascontiguousarray(image, np.uint8), original_from_turned
+
+
+def squeezed(gray: npt.NDArray[np.uint8], squeeze: float) -> npt.NDArray[np.uint8]:
+    """Scale an image [H, W] horizontally by `squeeze` <= 1, blurred first so as not to alias."""
+    if squeeze >= 1:
+        return np.ascontiguousarray(gray)
+    # .8 pixels is the blur that SIFT takes an image to have (as in ASIFT).
+    sigma = 0.8 * np.sqrt(1 / squeeze**2 - 1)
+    blurred = cv2.GaussianBlur(gray, (0, 0), sigmaX=sigma, sigmaY=0.01)
+    width = max(round(gray.shape[1] * squeeze), 1)
+    small = cv2.resize(blurred, (width, gray.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(small, np.uint8)
+
+
+def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArray[np.int64]:
+    """For each of the positions [K, 2], the index of the first one within `radius` that leads.
+
+    Greedy in the order given: a position that no earlier leader has taken leads all that are free
+    around it.
+    """
+    leader = np.full(len(positions), -1, np.int64)
+    if not len(positions):
+        return leader
+    around = cKDTree(positions).query_ball_point(positions, radius, return_sorted=True)
+    for index, neighbours in enumerate(around):
+        if leader[index] >= 0:
+            continue
+        for neighbour in neighbours:
+            if leader[neighbour] < 0:
+                leader[neighbour] = index
+    return leader
+
+
+def _sift(
+    gray: npt.NDArray[np.uint8], upright: bool, peak_threshold: float, max_features: int
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Keypoints [K, 4] (x, y, scale, orientation) and RootSIFT descriptors [K, 128] in 0..255."""
+    pycolmap = quiet_pycolmap()
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = 1
+    options.sift.max_num_features = max_features
+    options.sift.peak_threshold = peak_threshold
+    options.sift.upright = upright
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    keypoints, described = extractor.extract_from_uint8_array(gray)
+    rows = [
+        (point.x, point.y, point.compute_scale(), point.compute_orientation())
+        for point in keypoints
+    ]
+    return (
+        np.array(rows, np.float32).reshape(-1, 4),
+        np.array(described.data, np.float32).reshape(len(rows), 128),
+    )

@@ -1,0 +1,272 @@
+"""Cameras and sparse points from photographs alone: features, pairs, focal length, mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from pipeline.geometry.graph import Pair
+from stages.init.parallel import in_threads
+from stages.init.sfm.mapping import MappingInput, Solution
+from stages.init.sfm.matching.features import Features, detect_features
+from stages.init.sfm.matching.match import (
+    candidate_pairs,
+    match_features,
+    overlap_counts,
+    select_pairs,
+)
+from stages.init.sfm.matching.roll import find_rolls, groups
+from stages.init.sfm.matching.two_view import (
+    Correspondences,
+    Lens,
+    TwoView,
+    coherent_matches,
+    homography_share,
+    unrolled,
+)
+from stages.init.sfm.options import (
+    COHERENCE_RADIUS,
+    REFERENCE_SIDE,
+    VIEWS_PER_FREE_LENS,
+    ClassicalOptions,
+    RefinementOptions,
+)
+from stages.init.sfm.refine import refine_solution
+from stages.init.sfm.solver import Progress, Solver, known_focal, unknown_focal
+
+#: Defaults of the last adjustment.
+REFINEMENT = RefinementOptions()
+#: How many pairs are asked whether there is any parallax.
+PAIRS_CHECKED_FOR_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the photographs say of each other, for the diagnosis.
+
+    Attributes:
+        keypoints: [N] keypoints of each view.
+        matches: pair -> number of matches.
+        displacement: pair -> median length in pixels by which its coherent matches move.
+        edges: pair -> two-view geometry at the focal length used last.
+        linked: the pairs that can be believed.
+        flat: least share of the inliers of a pair that one homography explains, of the pairs used
+            that move most; 1: there is no depth to see.
+        correspondences: the matches themselves, that `edges` tell the inliers of.
+    """
+
+    keypoints: list[int]
+    matches: dict[Pair, int]
+    displacement: dict[Pair, float]
+    edges: dict[Pair, TwoView] = field(default_factory=dict)
+    linked: tuple[Pair, ...] = ()
+    flat: float = 0.0
+    correspondences: Mapping[Pair, Correspondences] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The outcome of `reconstruct`.
+
+    Attributes:
+        solution: the best reconstruction, or None.
+        evidence: for the diagnosis of what is missing.
+        focal_known: the focal length was given or is in EXIF.
+        focal_determined: the photographs determine it.
+    """
+
+    solution: Solution | None
+    evidence: Evidence
+    focal_known: bool
+    focal_determined: bool
+
+
+def reconstruct(
+    grays: list[npt.NDArray[np.uint8]],
+    valid: list[npt.NDArray[np.bool_]],
+    focals: list[float | None],
+    focal_given: bool,
+    ordered: bool,
+    options: ClassicalOptions,
+    *,
+    seed: int,
+    threads: int,
+    scratch: Path,
+    progress: Progress,
+    refinement: RefinementOptions = REFINEMENT,
+) -> Attempt:
+    """Find cameras and sparse points.
+
+    Args:
+        grays: N images [H, W] uint8.
+        valid: N masks [H, W]; outside there are no features.
+        focals: N focal lengths in pixels, or None where unknown.
+        focal_given: they are known for sure, and not to be refined.
+        ordered: the views are a sequence.
+        threads: how many to use; doesn't change the result.
+        scratch: folder for the mapper's files.
+        progress: called with (step, done, total).
+        refinement: settings of the last adjustment.
+    """
+    side = max(max(gray.shape) for gray in grays)
+    pixel = side / REFERENCE_SIDE
+    lenses, lens_of_view = group_lenses([gray.shape for gray in grays], focals)
+
+    def matched(rolls: list[float]) -> tuple[list[Features], Solver]:
+        features = find_features(grays, valid, options, threads, progress, rolls)
+        given = MappingInput(
+            lenses=lenses,
+            lens_of_view=lens_of_view,
+            positions=[feature.positions for feature in features],
+            points=[feature.points for feature in features],
+            correspondences=match_views(features, ordered, options, pixel, threads, progress),
+        )
+        return features, Solver(given, options, pixel, seed, threads, scratch)
+
+    features, solver = matched([0.0] * len(grays))
+    linked = solver.links()
+    if refinement.unroll and len(set(groups(linked, len(grays)))) > 1:
+        rolls = find_rolls(
+            grays, valid, linked, options.peak_threshold, pixel, threads, progress
+        )  # fmt: skip
+        if any(rolls):
+            features, solver = matched(rolls)
+    correspondences = solver.given.correspondences
+    evidence = Evidence(
+        keypoints=[len(np.unique(feature.points)) for feature in features],
+        matches={pair: len(found) for pair, found in correspondences.items()},
+        displacement={pair: _displacement(found) for pair, found in correspondences.items()},
+    )
+    free = options.refine_focal == "always" or (
+        options.refine_focal == "auto"
+        and not focal_given
+        and len(grays) >= VIEWS_PER_FREE_LENS * len(lenses)
+    )
+    known = all(lens.focal for lens in lenses)
+    if known:
+        best, determined = known_focal(solver, free, progress), True
+    else:
+        best, determined = unknown_focal(solver, free, progress)
+    if best is not None:
+        best = solver.with_other_mapper(best, free)
+        best = refine_solution(solver, best, free, refinement)
+    progress("reconstruct", 1, 1)
+    edges = solver.edges_used(best)
+    used = [pair for pair in best.edges if pair in edges] if best else []
+    used.sort(key=lambda pair: (-evidence.displacement[pair], pair))
+    shares = [
+        homography_share(
+            correspondences[pair], edges[pair].inliers, options.max_error * pixel, seed
+        )
+        for pair in used[:PAIRS_CHECKED_FOR_DEPTH]
+    ]
+    return Attempt(
+        solution=best,
+        evidence=replace(
+            evidence,
+            edges=edges,
+            linked=tuple(solver.believed(edges)),
+            flat=min(shares, default=0.0),
+            correspondences=correspondences,
+        ),
+        focal_known=known,
+        focal_determined=determined,
+    )
+
+
+def group_lenses(
+    shapes: Iterable[tuple[int, ...]], focals: list[float | None]
+) -> tuple[list[Lens], list[int]]:
+    """Share one lens among views of one size and one known focal length.
+
+    A view without a known focal length, where other views have one, is taken to have their median
+    over the long side.
+    """
+    sizes = [(shape[1], shape[0]) for shape in shapes]
+    known = [focal / max(size) for focal, size in zip(focals, sizes, strict=True) if focal]
+    usual = float(np.median(known)) if known else None
+    lenses: list[Lens] = []
+    lens_of_view = []
+    for (width, height), focal in zip(sizes, focals, strict=True):
+        if not focal and usual:
+            focal = usual * max(width, height)
+        lens = Lens(width, height, round(focal, 1) if focal else None)
+        if lens not in lenses:
+            lenses.append(lens)
+        lens_of_view.append(lenses.index(lens))
+    return lenses, lens_of_view
+
+
+def find_features(
+    grays: list[npt.NDArray[np.uint8]],
+    valid: list[npt.NDArray[np.bool_]],
+    options: ClassicalOptions,
+    threads: int,
+    progress: Progress,
+    rolls: list[float] | None = None,
+) -> list[Features]:
+    """The features of all views; `rolls` are their rolls in degrees, if any is known."""
+
+    def detect(view: int) -> Features:
+        return detect_features(
+            grays[view], valid[view],
+            squeezes=options.squeezes, upright=options.upright,
+            peak_threshold=options.peak_threshold, max_features=options.max_features,
+            merge_radius=options.merge_radius, roll=rolls[view] if rolls else 0.0,
+        )  # fmt: skip
+
+    return in_threads(
+        detect, range(len(grays)), threads, lambda done: progress("features", done, len(grays))
+    )
+
+
+def match_views(
+    features: list[Features],
+    ordered: bool,
+    options: ClassicalOptions,
+    pixel: float,
+    threads: int,
+    progress: Progress,
+) -> dict[Pair, Correspondences]:
+    """The matches of all pairs of views that may overlap."""
+    pairs = candidate_pairs(len(features), ordered, options.window)
+    with threadpool_limits(1, "blas"):
+        counts = overlap_counts(features, pairs, options.overlap_features)
+    pairs = select_pairs(counts, len(features), options.pairs_per_view)
+    plain = [np.flatnonzero(feature.squeezes == 1) for feature in features]
+
+    def match(pair: Pair) -> Correspondences:
+        i, j = pair
+        # Views this near each other match without the squeezed copies, at a fifth of the cost.
+        near = counts[pair] >= options.overlap_matches
+        found = match_features(
+            features[i], features[j],
+            ratio=options.match_ratio,
+            use_first=plain[i] if near else None,
+            use_second=plain[j] if near else None,
+        )  # fmt: skip
+        positions_i = features[i].positions[found[:, 0]]
+        positions_j = features[j].positions[found[:, 1]]
+        rolls = features[i].roll, features[j].roll
+        coherent = coherent_matches(
+            unrolled(positions_i, rolls[0]), unrolled(positions_j, rolls[1]),
+            COHERENCE_RADIUS * pixel,
+        )  # fmt: skip
+        return Correspondences(found, positions_i, positions_j, coherent, *rolls)
+
+    # OpenBLAS's own threads wait by spinning: under ours they took 2.6 times the CPU time.
+    with threadpool_limits(1, "blas"):
+        found = in_threads(
+            match, pairs, threads, lambda done: progress("matching", done, len(pairs))
+        )
+    return dict(zip(pairs, found, strict=True))
+
+
+def _displacement(found: Correspondences) -> float:
+    moved = (found.positions_j - found.positions_i)[found.coherent]
+    return float(np.median(np.linalg.norm(moved, axis=1))) if len(moved) else float("inf")
