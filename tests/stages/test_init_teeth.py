@@ -59,8 +59,8 @@ def read_teeth(count=3, aside=(), numbers=UPPER):
         rows = {}
         for jaw, top, teeth_of_row in (("upper", 20, numbers), ("lower", 50, LOWER)):
             crowns = []
-            for place, number in enumerate(teeth_of_row):
-                left = 30 + 20 * place
+            for column, number in enumerate(teeth_of_row):
+                left = 30 + 20 * column
                 corners = np.add([[0, 0], [19, 0], [19, 28], [0, 28]], [left, top])
                 top_middle = np.array([left + 9.5, top])
                 crowns.append(
