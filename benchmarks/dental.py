@@ -180,6 +180,15 @@ def rotation_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> Array:
     return np.degrees([Rotation.from_matrix(matrix).magnitude() for matrix in relative])
 
 
+def focal_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> list[float]:
+    """Percent by which each focal length found is longer than the true (or reference) one."""
+    return [
+        100 * (view.focal / float(np.sqrt(camera.fx * camera.fy)) - 1)
+        for view, camera in zip(placed, case.cameras, strict=True)
+        if view is not None
+    ]
+
+
 def epipolar_errors(case: Case, teeth: Reconstruction) -> tuple[float, float]:
     """Median Sampson distance in pixels of landmarks seen in two neighbouring photographs, under
     the cameras found and under the true (or reference) ones."""
@@ -301,11 +310,11 @@ def main() -> None:
     if options.only:
         sets = [PHOTOS if options.only == "photos" else options.only]
     print(
-        "| set | labels right / wrong / none | margin | rotation, degrees | epipolar error of "
-        "landmarks, px: found / truth | surface median / p90, "
+        "| set | labels right / wrong / none | margin | rotation, degrees | focal off, % | "
+        "epipolar error of landmarks, px: found / truth | surface median / p90, "
         "mm | within 1 mm | covered | CPU s | wall s |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for names in sets:
         case = read_case(options.data, names)
         cpu, wall = time.process_time(), time.perf_counter()
@@ -321,10 +330,11 @@ def main() -> None:
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
         labels = " / ".join(map(str, count_labels(case, scan, teeth)))
         errors = " ".join(f"{error:.1f}" for error in rotation_errors(case, teeth.fit.views))
+        focals = " ".join(f"{error:+.0f}" for error in focal_errors(case, teeth.fit.views))
         epipolar = " / ".join(f"{error:.1f}" for error in epipolar_errors(case, teeth))
         median, most, within, covered = surface_scores(case, scan, teeth)
         cells = (
-            names, labels, f"{teeth.fit.margin:.0f}", errors, epipolar,
+            names, labels, f"{teeth.fit.margin:.0f}", errors, focals, epipolar,
             f"{median:.3f} / {most:.2f}", f"{100 * within:.0f} %", f"{100 * covered:.1f} %",
             f"{cpu:.1f}", f"{wall:.1f}",
         )  # fmt: skip
