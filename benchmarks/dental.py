@@ -18,13 +18,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import open3d
-from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.fdi import teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from pipeline.geometry.rigid import angle_between, nearest_rotation
+from pipeline.geometry.similarity import similarity
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.solution import PlacedView
@@ -174,10 +175,8 @@ def rotation_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> Array:
     """Degrees per view after the one rotation that fits best."""
     pairs = [(v.cam_from_world[:3, :3], c.rotation)
              for v, c in zip(placed, case.cameras, strict=True) if v is not None]  # fmt: skip
-    u, _, vt = np.linalg.svd(sum(truth.T @ found for found, truth in pairs))
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    relative = [found @ (truth @ turn).T for found, truth in pairs]
-    return np.degrees([Rotation.from_matrix(matrix).magnitude() for matrix in relative])
+    turn = nearest_rotation(np.sum([truth.T @ found for found, truth in pairs], axis=0))
+    return np.array([angle_between(found, truth @ turn) for found, truth in pairs])
 
 
 def focal_errors(case: Case, placed: tuple[PlacedView | None, ...]) -> list[float]:
@@ -256,12 +255,12 @@ def surface_scores(
         truth.append(points[both])
     source, target = np.concatenate(found), np.concatenate(truth)
     drawn = np.random.default_rng(0).permutation(len(source))[:15_000]
-    motion = _similarity(source, target)
+    motion = similarity(source, target, np.ones(len(source)))
     for _ in range(5):
-        motion = _similarity(*_best(source, target, motion))
+        motion = _best(source, target, motion)
     for _ in range(25):
         nearest = scan.nearest(_moved(source[drawn], motion))
-        motion = _similarity(*_best(source[drawn], nearest, motion))
+        motion = _best(source[drawn], nearest, motion)
     placed_points = _moved(source, motion)
     distance = np.linalg.norm(scan.nearest(placed_points) - placed_points, axis=1)
     return (
@@ -276,23 +275,15 @@ def _tooth_pixels(case, ids, dentition):  # type: ignore[no-untyped-def]
     return cv2.erode(tooth.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
 
 
-def _similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(sign) @ vt
-    scale = float((s * sign).sum() / (a**2).sum())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
-
-
 def _moved(points: Array, motion: tuple[float, Array, Array]) -> Array:
     return motion[0] * points @ motion[1].T + motion[2]
 
 
-def _best(source: Array, target: Array, motion):  # type: ignore[no-untyped-def]
+def _best(source, target, motion):  # type: ignore[no-untyped-def]
+    """The similarity of the pairs that the last one brings nearest."""
     error = np.linalg.norm(_moved(source, motion) - target, axis=1)
     kept = error < np.percentile(error, KEPT)
-    return source[kept], target[kept]
+    return similarity(source[kept], target[kept], np.ones(int(kept.sum())))
 
 
 def main() -> None:

@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
+from pipeline.geometry.rigid import angle_between
+from pipeline.geometry.similarity import similarity
 
 Array = npt.NDArray[np.float64]
 
@@ -83,19 +85,8 @@ def rotation_errors(found: Sequence[Array], truth: Sequence[Array]) -> Array:
         for b in range(a):
             turn = found[a][:3, :3] @ found[b][:3, :3].T
             right = truth[a][:3, :3] @ truth[b][:3, :3].T
-            cosine = (np.trace(turn @ right.T) - 1) / 2
-            errors.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+            errors.append(angle_between(turn, right))
     return np.array(errors)
-
-
-def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation [3, 3] and shift [3] of least squares: target ~ s R source + t (Umeyama)."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float(values @ sign / (a**2).sum())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
 
 
 def centres(poses: Sequence[Array]) -> Array:
@@ -108,7 +99,7 @@ def translation_errors(found: Sequence[Array], truth: Sequence[Array]) -> Array:
     a, b = centres(found), centres(truth)
     if len(a) < 3:
         return np.full(len(a), np.nan)
-    scale, rotation, shift = similarity(a, b)
+    scale, rotation, shift = similarity(a, b, np.ones(len(a)))
     extent = np.linalg.norm(b[:, None] - b[None], axis=-1).max()
     missed: Array = np.linalg.norm(scale * a @ rotation.T + shift - b, axis=1)
     return 100 * missed / extent
@@ -154,6 +145,7 @@ def score_points(
     scale, rotation, shift = similarity(
         np.array([camera.centre for camera in cameras]),
         centres([view.cam_from_world for view in truth]),
+        np.ones(len(cameras)),
     )
     start = on_teeth if len(cameras) > 2 else on_teeth[:0]
     cloud = scale * on_teeth @ rotation.T + shift
@@ -161,7 +153,9 @@ def score_points(
     for _ in range(20 if len(start) else 0):
         distance, nearest = tree.query(sample, workers=-1)
         close = distance <= np.quantile(distance, 0.85)
-        scale, rotation, shift = similarity(sample[close], surface[nearest[close]])
+        scale, rotation, shift = similarity(
+            sample[close], surface[nearest[close]], np.ones(len(sample[close]))
+        )
         sample = scale * sample @ rotation.T + shift
         cloud = scale * cloud @ rotation.T + shift
     distance = tree.query(sample, workers=-1)[0]

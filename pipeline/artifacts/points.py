@@ -23,7 +23,8 @@ class Points(Artifact):
         positions: [N, 3] float32.
         colors: [N, 3] float32 sRGB in 0..1 (8 bits at rest).
         normals: [N, 3] float32 unit vectors towards the cameras that saw the point; 0 if unknown.
-        confidence: [N] float32, raw, >= 1, larger is better (as pointmap models give it).
+        confidence: [N] float32, raw, >= 1, larger is better (as pointmap models give it): filled
+            in, guessed or measured (`pipeline.artifacts.confidence`).
         scale: [N] float32 local spacing in world units (sigma of 3DGS's initialisation); 0 if
             unknown.
     """

@@ -1,4 +1,4 @@
-"""Rigid motions: small ones by a twist, and the angle of a rotation."""
+"""Rigid motions: small ones by a twist, the nearest rotation, and the angle of one."""
 
 from __future__ import annotations
 
@@ -33,9 +33,17 @@ def moved_by(twist: Array, pose: Array) -> Array:
     moved[:3, :3] = rotation @ pose[:3, :3]
     moved[:3, 3] = rotation @ pose[:3, 3] + translation
     # rounding must not turn a rotation into something else over thousands of steps
-    u, _, vt = np.linalg.svd(moved[:3, :3])
-    moved[:3, :3] = u @ vt
+    moved[:3, :3] = nearest_rotation(moved[:3, :3])
     return moved
+
+
+def nearest_rotation(matrix: npt.NDArray[np.floating]) -> Array:
+    """The rotation [3, 3] that a matrix [3, 3] comes nearest to (Frobenius norm; Arun 1987).
+
+    For a sum of products b a^T this is the rotation that brings the a best onto the b.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
 
 
 def rotation_angle(rotation: Array) -> Array:
@@ -51,3 +59,8 @@ def rotation_angle(rotation: Array) -> Array:
     )
     trace = np.trace(r, axis1=-2, axis2=-1)
     return np.asarray(np.arctan2(np.linalg.norm(sine, axis=-1), trace - 1))
+
+
+def angle_between(first: npt.NDArray[np.floating], second: npt.NDArray[np.floating]) -> float:
+    """Degrees of the rotation that leads from one rotation [3, 3] to the other."""
+    return float(np.degrees(rotation_angle(np.asarray(first) @ np.asarray(second).T)))

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.geometry.rigid import nearest_rotation
+
 Array = npt.NDArray[np.float64]
 
 
@@ -76,8 +78,7 @@ def camera_similarity(source: Array, target: Array, lever: float) -> tuple[float
     if len(a) < 2 or spread_a <= 1e-12 * lever or spread_b == 0:
         raise ValueError("the cameras of a similarity must be at two places at least")
     turns = np.einsum("nji,njk->ik", target[:, :3, :3], source[:, :3, :3])
-    u, _, vt = np.linalg.svd(b.T @ a * (spread_a / spread_b) + lever**2 * turns)
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = nearest_rotation(b.T @ a * (spread_a / spread_b) + lever**2 * turns)
     scale = float((b * (a @ rotation.T)).sum()) / spread_a**2
     if scale <= 0:  # the orientations say the opposite of the centres
         scale = spread_b / spread_a

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.rigid import nearest_rotation
 
 Array = npt.NDArray[np.float64]
 
@@ -65,8 +66,7 @@ def similarity_between(
     scale = float(np.linalg.norm(goals - goal) / spread) if spread > 1e-12 else 1.0
     # Orientations: R_target = R_camera R^T; the nearest rotation to all of them.
     product = sum(b.rotation.T @ a.rotation for a, b in zip(cameras, targets, strict=True))
-    u, _, vt = np.linalg.svd(np.asarray(product))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = nearest_rotation(np.asarray(product))
     return scale, rotation, goal - scale * rotation @ centre
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.confidence import FILLED
 from pipeline.geometry.normals import depth_normals
 
 Array = npt.NDArray[np.float32]
@@ -32,7 +33,7 @@ class FusionOptions:
         merge: drop a pixel that a more confident view explains (else every view's pixel stays).
     """
 
-    fill_confidence: float = 1.25
+    fill_confidence: float = FILLED
     fill_stride: int = 3
     relative_depth: float = 0.01
     front: float = 0.02

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
 
@@ -87,7 +88,7 @@ class AlignConfig(StageConfig):
         6, ge=2, description="From so many views on, the matches also correct focal lengths."
     )
     fill_confidence: float = Field(
-        1.25, ge=1,
+        FILLED, ge=1,
         description="Depths of no more confidence count as fill: used where nothing better is.",
     )  # fmt: skip
     fill_stride: int = Field(

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
 
@@ -58,9 +59,9 @@ class ExportConfig(StageConfig):
         "photograph shows",
     )
     mesh_confidence: float = Field(
-        1.25,
+        FILLED,
         ge=0,
-        description="only points with a confidence above this support the mesh; up to 1.25 their "
+        description="only points with a confidence above this support the mesh: up to it their "
         "depth was filled in, not measured",
     )
     video: bool = Field(True, description="write orbit.mp4")

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
 
@@ -41,7 +42,7 @@ class SapConfig(StageConfig):
         description="At most so many points are left: the voxels grow until they are. 0: no limit.",
     )  # fmt: skip
     fill_confidence: float = Field(
-        1.25, ge=1,
+        FILLED, ge=1,
         description="Points of no more confidence count as fill (backdrop, completed depth).",
     )  # fmt: skip
     fill_share: float = Field(

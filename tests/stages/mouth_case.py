@@ -18,6 +18,7 @@ from data_samples.mouths.cameras import Camera, look
 from pipeline.artifacts.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
+from pipeline.geometry.rigid import angle_between
 from stages.dentition.crowns import Outline, dentition_of
 
 WIDTH, HEIGHT = 512, 384
@@ -174,11 +175,6 @@ def true_numbers(photo: Photograph, dentition: Dentition) -> dict[str, tuple[int
             )
         rows[jaw] = tuple(numbers)
     return rows
-
-
-def angle_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Degrees between two rotations."""
-    return float(np.degrees(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1))))
 
 
 def relative_errors(found: Sequence[np.ndarray], true: Sequence[np.ndarray]) -> list[float]:

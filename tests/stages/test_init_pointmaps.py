@@ -13,7 +13,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from stages.align.stage import AlignConfig, AlignStage
-from stages.init.sfm.matching.two_view import angle_between
+from pipeline.geometry.rigid import angle_between
 from stages.init.stage import InitConfig, InitStage
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"

@@ -14,7 +14,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
 from pipeline.stage import LocalContext
 from stages.init.sfm.diagnosis import least_views, standing_still
-from stages.init.sfm.matching.two_view import angle_between
+from pipeline.geometry.rigid import angle_between
 from stages.init.sfm.reconstruct import Evidence, group_lenses
 from stages.init.stage import InitConfig, InitStage
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.confidence import FILLED, MEASURED
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.teeth import Dentition
@@ -53,8 +54,8 @@ ROUNDS = (
 #: from the usual colour: what is no gum at all does not match.
 LEAST_FACING, GUM_DEVIATIONS = 0.2, 5.0
 #: Where no photographs agree, the charts are still mm and not cm off, unlike what is filled in
-#: around them: their confidence is 1 + exp of this.
-GUESS = -0.5
+#: around them: a guess, half way from `FILLED` to `MEASURED` (confidence is 1 + exp of this).
+GUESS = float(np.log((FILLED + MEASURED) / 2 - 1))
 
 
 def neighbour_angle(cameras: list[Camera]) -> float:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.graph import Pair
+from pipeline.geometry.rigid import angle_between
 from stages.init.sfm.mapping import Solution
 from stages.init.sfm.matching.roll import groups
-from stages.init.sfm.matching.two_view import angle_between
 from stages.init.sfm.reconstruct import Attempt, Evidence
 
 #: Advice that helps in nearly all cases.

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from pipeline.geometry.rigid import nearest_rotation
 from stages.init.dental.cameras.algebra import (
     cholesky,
     eliminate,
@@ -88,9 +89,7 @@ def nearest_similarity(
         Rotation [3, 3] of the arch and its centre [3] mm in the first camera's frame, and the
         logarithm of how many mm the unit of the shifts is.
     """
-    product = np.einsum("vji,vjk->ik", turns, rotations)
-    u, _, vt = np.linalg.svd(product)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = nearest_rotation(np.einsum("vji,vjk->ik", turns, rotations))
     free = -np.einsum("vji,vj->vi", rotations, centres)
     held = -np.einsum("vji,vj->vi", turns, shifts)
     spread = float(np.linalg.norm(held - held.mean(0)))

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.colmap import quiet_pycolmap
 from pipeline.geometry.graph import Pair, spanning_pairs
+from pipeline.geometry.rigid import angle_between
 
 Array = npt.NDArray[np.float64]
 
@@ -235,12 +236,6 @@ def unrolled(positions: Array, degrees: float) -> Array:
         return positions
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.asarray(positions @ np.array([[cosine, -sine], [sine, cosine]]))
-
-
-def angle_between(first: Array, second: Array) -> float:
-    """Angle in degrees of the rotation that leads from one [3, 3] rotation to the other."""
-    cosine = (np.trace(first @ second.T) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def rotations_along(tree: list[Pair], edges: dict[Pair, TwoView], root: int) -> dict[int, Array]:
