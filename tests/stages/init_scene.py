@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.init.sfm.mapping import MappingInput
 from pipeline.geometry.rigid import angle_between
+from stages.init.sfm.mapping import MappingInput
 from stages.init.sfm.matching.two_view import Correspondences, Lens, coherent_matches
 
 WIDTH, HEIGHT, FOCAL = 512, 384, 700.0

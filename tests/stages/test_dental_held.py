@@ -135,7 +135,7 @@ def test_teeth_are_named_before_known_cameras_whatever_their_world() -> None:
     images = [np.full((*d.mask.shape, 3), 0.5, np.float32) for d in dentitions]
     result = fit_arch(
         dentitions, images, [np.ones(d.mask.shape, bool) for d in dentitions],
-        [950.0] * 3, ArchOptions(dense_rounds=0), 1, lambda *_: None,
+        [950.0] * 3, ArchOptions(dense_rounds=0, rows_tried=8), 1, lambda *_: None,
         cameras=[in_world(pose) for pose in poses],
     )  # fmt: skip
     assert arch_scene.rotation_errors(result, poses) == pytest.approx([0, 0], abs=1e-4)

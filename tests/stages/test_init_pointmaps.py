@@ -11,9 +11,9 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.pointmaps import PointmapPair, write_pair
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
+from pipeline.geometry.rigid import angle_between
 from pipeline.stage import LocalContext
 from stages.align.stage import AlignConfig, AlignStage
-from pipeline.geometry.rigid import angle_between
 from stages.init.stage import InitConfig, InitStage
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"

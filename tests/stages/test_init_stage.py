@@ -12,9 +12,9 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
+from pipeline.geometry.rigid import angle_between
 from pipeline.stage import LocalContext
 from stages.init.sfm.diagnosis import least_views, standing_still
-from pipeline.geometry.rigid import angle_between
 from stages.init.sfm.reconstruct import Evidence, group_lenses
 from stages.init.stage import InitConfig, InitStage
 
