@@ -41,6 +41,9 @@ PRIMARY_HEIGHTS: dict[Jaw, tuple[float, ...]] = {
 ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (30.5, 46.0), "lower": (28.0, 43.0)}
 #: How far the lower incisors reach up behind the upper ones, and lie behind them (mm).
 OVERBITE, OVERJET = 2.5, 2.2
+#: The gum goes on beyond the zeniths: steps (mm) gumwards and outwards, over the bulge of the
+#: alveolar process and back into the vestibule.
+GUM_STEPS = ((4.0, 0.8), (9.0, -0.5))
 #: Teeth a side, without wisdom teeth.
 TEETH_A_SIDE = 7
 #: Positions along a row, patient's right to left; the midline is between 6 and 7.

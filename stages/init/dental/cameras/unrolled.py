@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.fdi import is_upper
 from stages.init.dental.cameras.bundle import Adjusted, Matches
-from stages.init.dental.template import landmark_names
+from stages.init.dental.template import GUM_STEPS, landmark_names
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -29,8 +29,6 @@ HALF_HEIGHT = 17.0
 COARSENESS = 6
 #: Smoothing of the thin plate through the landmarks (mm^2 of its kernel).
 PLATE_SMOOTHING = 2.0
-#: The gum goes on beyond the zeniths: this far up (mm) and this far out.
-GUM = ((4.0, 0.3), (9.0, -0.5))
 #: Used is what faces the camera (cosine) and lies within this share of the band from a tooth.
 MIN_FACING = 0.3
 BAND_MARGIN = 0.5
@@ -135,7 +133,7 @@ def chart_surface(points: Array, scale: float) -> Array:
             out = (point - axis) * np.array([1.0, 0.0, 1.0])
             out /= np.linalg.norm(out)
             up = 1.0 if is_upper(name.tooth) else -1.0
-            gum += [point + out * far + np.array([0.0, up * high, 0.0]) for high, far in GUM]
+            gum += [point + out * far + np.array([0.0, up * high, 0.0]) for high, far in GUM_STEPS]
     samples = np.concatenate([points, np.array(gum)]) - axis
     flat = np.stack([np.arctan2(samples[:, 0], samples[:, 2]) * RADIUS, samples[:, 1]], axis=1)
     radius = np.hypot(samples[:, 0], samples[:, 2])

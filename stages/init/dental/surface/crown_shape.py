@@ -11,6 +11,7 @@ from scipy.interpolate import RBFInterpolator
 from pipeline.artifacts.fdi import Jaw, teeth_of
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.surface.chart import AXIS_DEPTH, ChartGrid, unroll
+from stages.init.dental.template import GUM_STEPS
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
@@ -22,8 +23,6 @@ _ALONG = (0.12, 0.35, 0.6, 0.85)
 #: Where between zenith and tip a crown bulges most, and how wide the bulge is: the height of
 #: contour lies in the third next to the gum.
 _CONTOUR, _CONTOUR_WIDTH = 0.35, 0.35
-#: Beyond the zenith the gum goes on: steps (mm) up and outwards.
-_GUM_STEPS = ((4.0, 0.8), (9.0, -0.5))
 #: Beyond the tip the surface turns inwards: mm past the tip, mm inwards.
 _TIP_STEP = (3.0, 0.8)
 #: The spline is evaluated on a grid so many times coarser: it has no finer detail.
@@ -112,7 +111,7 @@ def crown_points(
     The gum goes on straight to `gum_height` where that is further than it usually bends.
     """
     points = [point for _, point in sorted(shape.landmarks.items())]
-    steps = list(_GUM_STEPS)
+    steps = list(GUM_STEPS)
     if gum_height > steps[-1][0]:
         steps.append((gum_height, steps[-1][1]))
     for k, tooth in enumerate(shape.teeth):
