@@ -21,7 +21,7 @@ import open3d
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.fdi import teeth_of
+from pipeline.artifacts.dental.fdi import teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError

@@ -242,6 +242,31 @@ def plan_stage(
     return planned
 
 
+def plan_chain(
+    chain: Chain, config: Config, store: Store, images: Sequence[str | Path]
+) -> list[PlannedStage]:
+    """Look at every stage of a chain without running any.
+
+    Args:
+        images: what the user gave.
+
+    Raises:
+        RequestError: a needed kind is nowhere, or the photographs can't be found or read.
+    """
+    table = provider_table(chain, store)
+    planned = []
+    for name in chain.names:
+        stage = plan_stage(name, config, store, table, images)
+        planned.append(stage)
+        if stage.result is not None:
+            made = tuple(stage.result.contents)
+        else:
+            made = (*get_stage(name).provides, *get_stage(name).may_provide)
+        for kind in made:
+            table[kind] = Input(name, kind, stage.result)
+    return planned
+
+
 def _hash_source(label: str, path: Path) -> str:
     try:
         stat = path.stat()

@@ -18,9 +18,13 @@ from pipeline.artifacts import Artifact, artifact_class
 from pipeline.errors import RequestError, nearest
 
 if TYPE_CHECKING:
-    from pipeline.checkup import Finding
+    from pipeline.pages.case import Case
+    from pipeline.pages.parts import Part
 
 ENTRY_POINT_GROUP = "dentalsplat.stages"
+
+#: Name of a part of the page about a run -> what draws it.
+Parts = Mapping[str, "Callable[[Case], Iterable[Part]]"]
 
 
 class StageConfig(BaseModel):
@@ -81,6 +85,21 @@ class StageContext(ABC):
         """Record figures for the run's summary and the manifest (counts, errors; no timings)."""
 
 
+@dataclass
+class Finding:
+    """One thing that was checked.
+
+    Attributes:
+        level: ``ok``, ``note`` (works, but could be better) or ``problem`` (a run would fail).
+        mend: what to do about it, where there is something to do.
+    """
+
+    name: str
+    level: str
+    detail: str
+    mend: str = ""
+
+
 class Stage(ABC):
     """One step of the pipeline: artifacts in, artifacts out.
 
@@ -132,6 +151,14 @@ class Stage(ABC):
     def findings(self) -> Iterable[Finding]:
         """What `pipeline doctor` should say of this stage: optional parts that are there or not."""
         return ()
+
+    def report(self) -> Parts:
+        """What the page about a run says of this stage (`pipeline.pages.parts`).
+
+        Each part is drawn by itself, so that a damaged file costs no other. What draws them lies in
+        a module of its own, imported here.
+        """
+        return {}
 
     @abstractmethod
     def run(self, context: StageContext) -> None:

@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 COLMAP_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 #: OpenGL cameras (y up, z back), which `transforms.json` holds, to OpenCV cameras.
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-#: The setting that names the cameras, where a message does not say another.
-SETTING = "init.cameras"
+#: What messages call the cameras where no setting is named.
+SETTING = "cameras"
 
 
 @dataclass(frozen=True)

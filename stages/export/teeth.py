@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.fdi import is_primary, is_upper, universal_number
+from pipeline.artifacts.dental.fdi import is_primary, is_upper, universal_number
 from pipeline.artifacts.teeth import Dentition, Teeth, filled
 from pipeline.artifacts.views import View, Views
 from stages.splatting.rendering import RenderedView

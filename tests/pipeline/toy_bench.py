@@ -142,7 +142,7 @@ STAGES = {
 
 def install() -> None:
     """Replace the registered stages of this process by the toys."""
-    from pipeline.benchmarking import running
+    from pipeline.studies.benchmark import running
 
     KINDS["numbers"] = "toy:Numbers"
     pipeline.stage._entry_points = lambda: STAGES  # type: ignore[assignment]
@@ -155,7 +155,7 @@ if __name__ == "__main__":
     assert toy.Numbers is Numbers
     install()
     if sys.argv[1] == "worker":
-        from pipeline.benchmarking.worker import main as worker
+        from pipeline.studies.benchmark.worker import main as worker
 
         worker()
     else:
