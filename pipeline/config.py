@@ -191,7 +191,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise RequestError(
-            f"--set takes stage.key=value, as in --set sap.quantile=0.99; this is '{text}'."
+            f"--set takes stage.key=value, as 'pipeline stages' lists them; this is '{text}'."
         )
     try:
         return key.strip(), _yaml(value)

@@ -151,9 +151,10 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
 
 
 def _nobody_provides(name: str, kind: str) -> str:
-    makers = [n for n, stage in usable_stages().items() if kind in stage.provides and n != name]
+    usable = usable_stages()
+    makers = [n for n, stage in usable.items() if kind in stage.provides and n != name]
     from_where = f" ({' or '.join(makers)} would make them)" if makers else ""
-    if kind == "views":
+    if makers and all(usable[maker].uses_sources for maker in makers):
         return f"The stage '{name}' needs photographs: give a folder, files, a glob or a video."
     return (
         f"The stage '{name}' needs {kind}, which no earlier stage of this run provides and this "

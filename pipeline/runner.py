@@ -19,7 +19,7 @@ from pipeline.planning import (
     provider_table,
     resolve_chain,
 )
-from pipeline.stage import StageContext, get_stage
+from pipeline.stage import StageContext, get_stage, usable_stages
 from pipeline.store import CorruptResultError, Result, Store, is_disk_full
 from pipeline.workspace import Request
 
@@ -114,14 +114,21 @@ class RunContext(StageContext):
         return kind in self._planned.inputs
 
     def load(self, kind: str) -> Any:
-        result = self._planned.inputs[kind].result
-        assert result is not None, f"{kind} is loaded before it was made"
-        return self._store.load(result, kind)
+        entry = self._planned.inputs.get(kind)
+        if entry is None or entry.result is None:
+            raise StageError(
+                f"The stage '{self._planned.name}' asks for {kind}, which it was not given. "
+                "Name it in `requires`, or in `optional` and ask `has` first."
+            )
+        return self._store.load(entry.result, kind)
 
     def output(self, kind: str) -> Path:
         stage = get_stage(self._planned.name)
-        declared = (*stage.provides, *stage.may_provide)
-        assert kind in declared, f"{stage.name} does not declare that it provides {kind}"
+        if kind not in (*stage.provides, *stage.may_provide):
+            raise StageError(
+                f"The stage '{stage.name}' writes {kind} without saying so. Name it in `provides` "
+                "or `may_provide`."
+            )
         path = self._folder / kind
         path.mkdir(exist_ok=True)
         if kind not in self.outputs:
@@ -298,6 +305,12 @@ class Runner:
         except Exception as error:
             raise self._explain_failure(error, name, key) from error
 
+    def _thrift(self) -> list[str]:
+        """What the stages of this run know to do where memory runs out."""
+        found = usable_stages()
+        names = (*self.chain.upstream, *self.chain.names)
+        return [found[name].thrift for name in names if name in found and found[name].thrift]
+
     def _explain_failure(self, error: Exception, name: str, key: str) -> PipelineError:
         """Turn any failure into one paragraph, and leave the store as it was."""
         if is_disk_full(error, self.request.workspace):
@@ -312,8 +325,7 @@ class Runner:
             failure = error
         elif isinstance(error, MemoryError):
             failure = StageError(
-                f"The stage '{name}' needs more memory than there is. Use fewer photographs "
-                "(--frames) or a smaller working size (--set views.long_side=384)."
+                " ".join([f"The stage '{name}' needs more memory than there is.", *self._thrift()])
             )
         else:
             where = traceback.extract_tb(error.__traceback__)[-1]

@@ -57,6 +57,9 @@ class ViewsStage(Stage):
         "av", "opencv-contrib-python-headless", "pillow", "pillow-heif",
     )  # fmt: skip
     uses_sources: ClassVar[bool] = True
+    thrift: ClassVar[str] = (
+        "Use fewer photographs (--frames) or a smaller working size (--set views.long_side=384)."
+    )
 
     def sources(self, config: ViewsConfig, request: Mapping[str, Any]) -> Mapping[str, Path]:
         files = find_images(request["images"])

@@ -135,9 +135,8 @@ class ExportStage(Stage):
 
 
 ORDER = ["views", "init", "fit", "export", "evaluate"]
-STAGES = {
-    s.name: ToyEntryPoint(s) for s in (ViewsStage, InitStage, FitStage, ExportStage, EvaluateStage)
-}
+TOYS = (ViewsStage, InitStage, FitStage, ExportStage, EvaluateStage)
+STAGES = {stage.name: [ToyEntryPoint(stage)] for stage in TOYS}
 
 
 def install() -> None:
