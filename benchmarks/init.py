@@ -28,7 +28,7 @@ import numpy as np
 from init_scores import Truth, read_truth, rotation_errors, score_points, translation_errors
 
 from pipeline.errors import ReconstructionError
-from pipeline.geometry.known_cameras import model_files, read_cameras
+from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext, get_stage
 from pipeline.studies.compare.colmap_run import SETTINGS, Job, run_job
 from pipeline.studies.compare.models import model_folders

@@ -30,7 +30,7 @@ class EvaluateStage(Stage):
     )  # fmt: skip
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from pipeline.geometry.known_cameras import model_files
+        from pipeline.geometry.models.known_cameras import model_files
         from stages.evaluate.perceptual import find_vgg_weights
 
         found: dict[str, Path] = {}

@@ -138,8 +138,8 @@ def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array
     scaled = outline * (np.array([view.width, view.height]) / np.array(size))
     if not view.lens_taken_out:
         return np.asarray(scaled, np.float64)
-    from pipeline.geometry.colmap import quiet_pycolmap
-    from pipeline.geometry.known_cameras import (
+    from pipeline.geometry.models.colmap import quiet_pycolmap
+    from pipeline.geometry.models.known_cameras import (
         KnownCamera,
         pinhole_camera,
         working_pixels_from_lens,

@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
-from pipeline.geometry.model_points import as_points, read_model_points
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.models.model_points import as_points, read_model_points
 from pipeline.stage import StageContext
 from stages.init.config import CAMERAS, InitConfig
 from stages.init.place import photo_name

@@ -13,7 +13,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.graph import Pair
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole, rounded
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole, rounded
 from stages.init.config import CAMERAS
 from stages.init.placement import Placement
 from stages.init.sfm.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of

@@ -14,7 +14,7 @@ from pipeline.stage import Parts, Stage, StageContext
 from stages.init.config import CAMERAS, InitConfig
 
 if TYPE_CHECKING:
-    from pipeline.geometry.known_cameras import KnownCamera
+    from pipeline.geometry.models.known_cameras import KnownCamera
     from pipeline.stage import Finding
     from stages.init.sfm.options import ClassicalOptions
     from stages.pointmaps.options import PointmapOptions
@@ -111,7 +111,7 @@ class InitStage(Stage):
 
 def _inputs(config: InitConfig) -> Mapping[str, Path]:
     """The files that the settings name: cameras, or pointmaps and weights."""
-    from pipeline.geometry.known_cameras import model_files
+    from pipeline.geometry.models.known_cameras import model_files
 
     if config.cameras is not None:
         if config.method not in ("auto", "known", "dental"):
@@ -254,7 +254,7 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
-    from pipeline.geometry.known_cameras import matching_cameras, read_cameras
+    from pipeline.geometry.models.known_cameras import matching_cameras, read_cameras
     from stages.init.place import place_known
     from stages.init.write import densify
 
@@ -292,7 +292,7 @@ def _teeth_are_wide_apart(
     context: StageContext, views: Views, known: dict[str, KnownCamera]
 ) -> bool:
     """Few photographs of teeth with known cameras, too far apart for dense stereo."""
-    from pipeline.geometry.known_cameras import pinhole_camera
+    from pipeline.geometry.models.known_cameras import pinhole_camera
     from stages.init.dental.place_known import neighbour_angle
 
     config: InitConfig = context.config

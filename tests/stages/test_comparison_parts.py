@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from pipeline.geometry.model_points import as_points, read_model_points
+from pipeline.geometry.models.model_points import as_points, read_model_points
 from pipeline.studies.compare import clouds, evidence, poses
 from pipeline.studies.compare.colmap_run import (
     SETTINGS,

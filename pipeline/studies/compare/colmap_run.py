@@ -23,7 +23,7 @@ import numpy.typing as npt
 from pipeline.artifacts.views import View, to_uint8, write_png
 from pipeline.errors import RequestError
 from pipeline.files import canonical_json, content_hash, folder_listing, read_json, write_json
-from pipeline.geometry.colmap import quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
 
 #: COLMAP's options by step: what differs from its defaults.
 Options = Mapping[str, Mapping[str, Any]]

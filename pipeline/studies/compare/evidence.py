@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.geometry.colmap import quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
 
 Pair = tuple[str, str]
 #: COLMAP numbers a pair of images by id1 * this + id2.

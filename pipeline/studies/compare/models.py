@@ -9,13 +9,13 @@ from pathlib import Path
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from pipeline.geometry.known_cameras import (
+from pipeline.geometry.models.known_cameras import (
     matching_cameras,
     model_files,
     pinhole_camera,
     read_cameras,
 )
-from pipeline.geometry.model_points import ModelPoints, read_model_points
+from pipeline.geometry.models.model_points import ModelPoints, read_model_points
 
 
 @dataclass(frozen=True)

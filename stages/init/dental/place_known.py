@@ -14,7 +14,7 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.geometry.world import similarity_between
 from pipeline.stage import StageContext
 from stages.dentition.crowns import dentition_of, outline_of

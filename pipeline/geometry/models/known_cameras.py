@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, to_uint8
 from pipeline.errors import RequestError
-from pipeline.geometry.colmap import check_whole, quiet_pycolmap
+from pipeline.geometry.models.colmap import check_whole, quiet_pycolmap
 
 Array = npt.NDArray[np.float64]
 

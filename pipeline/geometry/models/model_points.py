@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
-from pipeline.geometry.colmap import quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
 
 Integers = npt.NDArray[np.int64]
 
