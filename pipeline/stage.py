@@ -257,7 +257,13 @@ def get_stage(name: str) -> Stage:
     stage: type[Stage]
     stage, where = load(f"stage '{name}'", found[name], Stage)
     _check(stage, name, where)
-    return stage()
+    try:
+        return stage()
+    except Exception as error:
+        raise RequestError(
+            f"{where} can't be made: {type(error).__name__}: {error}. A stage is made without "
+            "arguments, and does nothing yet."
+        ) from error
 
 
 def _check(stage: type[Stage], name: str, where: str) -> None:
@@ -277,6 +283,12 @@ def _check(stage: type[Stage], name: str, where: str) -> None:
             f"{where} has no Config. Set it to its settings, a class derived from "
             "pipeline.stage.StageConfig."
         )
+    for setting, field_info in config.model_fields.items():
+        if field_info.is_required():
+            raise RequestError(
+                f"{where} has the setting '{setting}' without a default. Give it one: runs without "
+                "this stage have settings for it too."
+            )
     known = kinds()
     for attribute in ("requires", "optional", "provides", "may_provide"):
         named = getattr(stage, attribute)

@@ -155,8 +155,11 @@ def _stages() -> Iterator[Finding]:
             stage = get_stage(name)
         except PipelineError as error:
             yield Finding(f"stage {name}", "problem", str(error))
-        else:
-            yield from stage.findings()
+            continue
+        try:
+            yield from list(stage.findings())
+        except Exception as error:
+            yield Finding(f"stage {name}", "problem", f"{type(error).__name__}: {error}")
     yield Finding("stages", "ok", ", ".join(names))
 
 

@@ -155,6 +155,12 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Outside
         (('name, version, summary = "sharp", 1,', 'name, summary = "sharp",'), {}, "no version"),
         (('name, version, summary = "sharp", 1, "how', 'version, _ = 1, "how'), {}, "name = None"),
         (("    class Config(StageConfig)", "    class Config"), {}, "has no Config"),
+        (("step: int = 1", "step: int"), {}, "has the setting 'step' without a default"),
+        (
+            ("    def run(self", "    def __init__(self): 1 / 0\n    def run(self"),
+            {},
+            "can't be made",
+        ),
         (("def run(self, context)", "def ran(self, context)"), {}, "lacks run"),
         (('("sharpness",)', '"sharpness"'), {}, "has provides = 'sharpness'"),
         (('kind = "sharpness"', 'kind = "blur"'), {}, "has kind = 'blur'"),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.artifacts.metrics import Metrics
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.front.commands import run
@@ -88,7 +89,7 @@ def _row_in_use(results: Mapping[str, Result | None]) -> dict[str, Any]:
     if scored.manifest["inputs"]["gaussians"]["content"] != fit.contents["gaussians"]:
         return row | {"failure": "evaluated was an earlier fit; run 'pipeline run' again"}
     return row | figures_of(
-        read_json(scored.folder / "metrics" / "metrics.json"), fit.manifest,
+        Metrics.load(scored.folder / "metrics"), fit.manifest,
         sum(entry.manifest["wall_seconds"] for entry in results.values() if entry),
     )  # fmt: skip
 
@@ -110,27 +111,23 @@ def _run(
     scored, fit = by_name["evaluate"].folder, by_name["fit"].folder
     assert scored is not None
     assert fit is not None
-    metrics = read_json(scored / "metrics" / "metrics.json")
-    return figures_of(metrics, read_json(fit / "manifest.json"), seconds)
+    return figures_of(Metrics.load(scored / "metrics"), read_json(fit / "manifest.json"), seconds)
 
 
-def figures_of(
-    metrics: Mapping[str, Any], fit: Mapping[str, Any], seconds: float
-) -> dict[str, Any]:
+def figures_of(metrics: Metrics, fit: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     """The figures of one fit: mean PSNR and SSIM of input views and held-out photographs."""
     row: dict[str, Any] = {
         "iterations": fit["summary"].get("iterations"),
-        "gaussians": metrics["gaussians"],
-        "views": len(metrics["views"]),
-        "psnr": metrics["mean"]["psnr"],
-        "ssim": metrics["mean"]["ssim"],
+        "gaussians": metrics.figures["gaussians"],
+        "views": len(metrics.input.views),
+        "psnr": metrics.input.mean["psnr"],
+        "ssim": metrics.input.mean["ssim"],
         "seconds": round(seconds, 1),
     }
-    for protocol, scores in sorted(metrics.get("held_out", {}).items()):
-        if isinstance(scores, dict) and "mean" in scores:
-            row[f"held_out_{protocol}"] = {
-                "psnr": scores["mean"]["psnr"],
-                "ssim": scores["mean"]["ssim"],
-                "views": len(scores["views"]),
-            }
+    for protocol, scores in sorted(metrics.held_out.items()):
+        row[f"held_out_{protocol}"] = {
+            "psnr": scores.mean["psnr"],
+            "ssim": scores.mean["ssim"],
+            "views": len(scores.views),
+        }
     return row

@@ -49,7 +49,6 @@ def write_run_report(workspace: Path) -> Path:
         "pipeline.studies.report", "run.html", workspace / REPORT,
         title=workspace.resolve().name, case=case, failed=case.failed, notes=case.notes,
         stale=[r for r in case.stages if r.state in ("stale", "pending") and r.result],
-        missing=[r for r in case.stages if r.result is None and not r.failure],
         total=len(views) if views else 0, warnings=list(case.warnings()), costs=costs(manifests),
         cards=_only(Card, first_last), facts=_only(Fact, first_last),
         hero=next(iter(_only(Hero, first_last)), None), links=links(case, first_last),
