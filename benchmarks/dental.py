@@ -20,7 +20,7 @@ import numpy.typing as npt
 import open3d
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.fdi import teeth_of
+from pipeline.artifacts.dental.fdi import teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError

@@ -28,14 +28,14 @@ import numpy as np
 from init_scores import Truth, read_truth, rotation_errors, score_points, translation_errors
 
 from pipeline.errors import ReconstructionError
-from pipeline.geometry.known_cameras import model_files, read_cameras
+from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext, get_stage
-from stages.comparison.colmap_run import SETTINGS, Job, run_job
-from stages.comparison.models import model_folders
+from pipeline.studies.compare.colmap_run import SETTINGS, Job, run_job
+from pipeline.studies.compare.models import model_folders
 
 METHODS = ("colmap", "sparse", "ours")
 
-#: COLMAP's settings by method (`stages.comparison.colmap_run`).
+#: COLMAP's settings by method (`pipeline.studies.compare.colmap_run`).
 COLMAP_SETTINGS = {"colmap": "defaults", "sparse": "sparse"}
 
 COLUMNS = {

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from triads_data import CASE, FRONTS, SERIES, SIDES, SWAPPED, Item, Photo, TruthPoint
 from triads_run import Outcome
 
-from pipeline.artifacts.fdi import JAWS, permanent_of
+from pipeline.artifacts.dental.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.overlay import DOUBT_SHOWN
 

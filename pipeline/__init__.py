@@ -13,14 +13,14 @@ import importlib
 from typing import Any
 
 _HOMES = {
-    "run": "pipeline.runner",
+    "run": "pipeline.front.commands",
     "status": "pipeline.workspace",
-    "stages": "pipeline.workspace",
+    "stages": "pipeline.front.commands",
     "clean": "pipeline.workspace",
-    "doctor": "pipeline.checkup",
-    "benchmark": "pipeline.benchmarking.running",
-    "run_report": "pipeline.report",
-    "compare": "stages.comparison.compare",
+    "doctor": "pipeline.front.checkup",
+    "benchmark": "pipeline.studies.benchmark.running",
+    "run_report": "pipeline.studies.report",
+    "compare": "pipeline.studies.compare.compare",
     "PipelineError": "pipeline.errors",
     "RequestError": "pipeline.errors",
     "ReconstructionError": "pipeline.errors",

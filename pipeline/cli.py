@@ -102,9 +102,9 @@ def run_command(
     ] = False,
 ) -> None:
     """Reconstruct a scene from photographs; every stage's result is cached."""
-    from pipeline.progress import make_reporter
-    from pipeline.runner import run
-    from pipeline.summary import print_dry_run, print_summary
+    from pipeline.front.commands import run
+    from pipeline.front.progress import make_reporter
+    from pipeline.front.summary import print_dry_run, print_summary
 
     changes = list(overrides or [])
     if frames is not None:
@@ -138,7 +138,7 @@ def status_command(
     as_json: AsJson = False,
 ) -> None:
     """Show each stage: cached, stale (and which field or input changed), missing or failed."""
-    from pipeline.summary import print_status
+    from pipeline.front.summary import print_status
     from pipeline.workspace import status
 
     found = status(
@@ -157,7 +157,7 @@ def status_command(
 @app.command("report")
 def report_command(workspace: Workspace = None) -> None:
     """Write WORKSPACE/report.html: what came out, how sure it is, and everything behind it."""
-    from pipeline.report import run_report
+    from pipeline.studies.report import run_report
 
     print(run_report(workspace or _only_workspace()))
 
@@ -165,8 +165,8 @@ def report_command(workspace: Workspace = None) -> None:
 @app.command("stages")
 def stages_command(as_json: AsJson = False) -> None:
     """List the registered stages and methods, with what they require and provide."""
-    from pipeline.summary import print_stages
-    from pipeline.workspace import stages
+    from pipeline.front.commands import stages
+    from pipeline.front.summary import print_stages
 
     found = stages()
     if as_json:
@@ -178,8 +178,8 @@ def stages_command(as_json: AsJson = False) -> None:
 @app.command("doctor")
 def doctor_command(as_json: AsJson = False) -> None:
     """Check the installation and say how to mend what is wrong."""
-    from pipeline.checkup import doctor
-    from pipeline.summary import print_findings
+    from pipeline.front.checkup import doctor
+    from pipeline.front.summary import print_findings
 
     found = doctor()
     if as_json:
@@ -220,9 +220,9 @@ def compare_command(
     --set swap.cameras=MODEL puts them in place of ours after any stage; fit.optimize_poses=false
     keeps them. Results: WORKSPACE/compare/comparison.json, comparison.md and report.html.
     """
-    from pipeline.progress import make_reporter
-    from stages.comparison.compare import compare
-    from stages.comparison.tables import print_tables, tables_of
+    from pipeline.front.progress import make_reporter
+    from pipeline.studies.compare.compare import compare
+    from pipeline.studies.compare.tables import print_tables, tables_of
 
     found = compare(
         workspace or _only_workspace(), colmap=colmap, run_colmap=run_colmap,
@@ -260,8 +260,8 @@ def benchmark_command(
     pipeline benchmark configs/suites/paper.yaml --data ../data --jobs 2. Finished cells are not run
     again. Results: tables.md, tables.csv, results.json and report.html.
     """
-    from pipeline.benchmarking.running import benchmark
-    from pipeline.benchmarking.writing import markdown
+    from pipeline.studies.benchmark.running import benchmark
+    from pipeline.studies.benchmark.writing import markdown
 
     results = benchmark(
         suite, out=out, data=data, jobs=jobs, overrides=overrides or [],

@@ -107,11 +107,15 @@ def result_fields(config: BaseModel) -> dict[str, Any]:
     return kept
 
 
+def preset_folder() -> Path:
+    """Where the presets lie: beside the packages in the project, in a package where installed."""
+    beside = Path(__file__).resolve().parents[1] / "configs"
+    return beside if beside.is_dir() else Path(str(files("pipeline.presets")))
+
+
 def presets() -> dict[str, Path]:
     """The presets that come with dentalsplat: name -> file."""
-    beside = Path(__file__).resolve().parents[1] / "configs"
-    folder = beside if beside.is_dir() else Path(str(files("pipeline.presets")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(preset_folder().glob("*.yaml"))}
 
 
 def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
@@ -187,7 +191,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise RequestError(
-            f"--set takes stage.key=value, as in --set sap.quantile=0.99; this is '{text}'."
+            f"--set takes stage.key=value, as 'pipeline stages' lists them; this is '{text}'."
         )
     try:
         return key.strip(), _yaml(value)

@@ -151,9 +151,10 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
 
 
 def _nobody_provides(name: str, kind: str) -> str:
-    makers = [n for n, stage in usable_stages().items() if kind in stage.provides and n != name]
+    usable = usable_stages()
+    makers = [n for n, stage in usable.items() if kind in stage.provides and n != name]
     from_where = f" ({' or '.join(makers)} would make them)" if makers else ""
-    if kind == "views":
+    if makers and all(usable[maker].uses_sources for maker in makers):
         return f"The stage '{name}' needs photographs: give a folder, files, a glob or a video."
     return (
         f"The stage '{name}' needs {kind}, which no earlier stage of this run provides and this "
@@ -239,6 +240,31 @@ def plan_stage(
             planned.state, planned.failure = "failed", failure["message"]
     elif pointer and pointer["key"] == key:
         planned.reasons = list(pointer.get("reasons", []))
+    return planned
+
+
+def plan_chain(
+    chain: Chain, config: Config, store: Store, images: Sequence[str | Path]
+) -> list[PlannedStage]:
+    """Look at every stage of a chain without running any.
+
+    Args:
+        images: what the user gave.
+
+    Raises:
+        RequestError: a needed kind is nowhere, or the photographs can't be found or read.
+    """
+    table = provider_table(chain, store)
+    planned = []
+    for name in chain.names:
+        stage = plan_stage(name, config, store, table, images)
+        planned.append(stage)
+        if stage.result is not None:
+            made = tuple(stage.result.contents)
+        else:
+            made = (*get_stage(name).provides, *get_stage(name).may_provide)
+        for kind in made:
+            table[kind] = Input(name, kind, stage.result)
     return planned
 
 

@@ -4,25 +4,48 @@ from __future__ import annotations
 
 import shutil
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import Config, load_config
+from pipeline.config import Config
 from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
 from pipeline.measure import Measurement
 from pipeline.planning import (
     Input,
     PlannedStage,
+    plan_chain,
     plan_stage,
     provider_table,
     resolve_chain,
 )
-from pipeline.progress import Reporter
-from pipeline.request import Request, make_request
-from pipeline.stage import StageContext, get_stage
+from pipeline.stage import StageContext, get_stage, usable_stages
 from pipeline.store import CorruptResultError, Result, Store, is_disk_full
+from pipeline.workspace import Request
+
+Figure = float | int | str
+
+
+class Reporter:
+    """Hears what happens in a run. This one says nothing; the others show it."""
+
+    def start(self, stages: list[str]) -> None:
+        """A run of these stages begins."""
+
+    def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
+        """A stage begins to compute."""
+
+    def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
+        """A stage has come to `done` of `total` in `step`."""
+
+    def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
+        """A stage's result is in the store."""
+
+    def message(self, text: str) -> None:
+        """Something that the user should know."""
+
+    def stop(self) -> None:
+        """The run is over, well or not."""
 
 
 @dataclass
@@ -91,14 +114,21 @@ class RunContext(StageContext):
         return kind in self._planned.inputs
 
     def load(self, kind: str) -> Any:
-        result = self._planned.inputs[kind].result
-        assert result is not None, f"{kind} is loaded before it was made"
-        return self._store.load(result, kind)
+        entry = self._planned.inputs.get(kind)
+        if entry is None or entry.result is None:
+            raise StageError(
+                f"The stage '{self._planned.name}' asks for {kind}, which it was not given. "
+                "Name it in `requires`, or in `optional` and ask `has` first."
+            )
+        return self._store.load(entry.result, kind)
 
     def output(self, kind: str) -> Path:
         stage = get_stage(self._planned.name)
-        declared = (*stage.provides, *stage.may_provide)
-        assert kind in declared, f"{stage.name} does not declare that it provides {kind}"
+        if kind not in (*stage.provides, *stage.may_provide):
+            raise StageError(
+                f"The stage '{stage.name}' writes {kind} without saying so. Name it in `provides` "
+                "or `may_provide`."
+            )
         path = self._folder / kind
         path.mkdir(exist_ok=True)
         if kind not in self.outputs:
@@ -116,41 +146,6 @@ class RunContext(StageContext):
         self.figures.update(figures)
 
 
-def run(
-    images: Sequence[str | Path] | str | Path = (),
-    *,
-    workspace: str | Path | None = None,
-    preset: str | Path | None = None,
-    overrides: Iterable[str] | Mapping[str, Any] = (),
-    stages: Sequence[str] | None = None,
-    from_stage: str | None = None,
-    force: bool = False,
-    dry_run: bool = False,
-    reporter: Reporter | None = None,
-) -> RunSummary:
-    """Run the pipeline on photographs, reusing every result that is still valid.
-
-    Args:
-        images: a folder, files, a glob pattern or one video; empty to take the `views` that the
-            workspace holds as they are.
-        workspace: where results are kept; default ``./runs/<name of the input>``.
-        preset: name or YAML file of a preset.
-        overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.
-        stages: names of the stages to run, in order; default all of the preset.
-        from_stage: begin here, with what the workspace holds from before.
-        force: compute the stages anew although a valid result exists.
-        dry_run: only say what would be done.
-        reporter: hears of the progress.
-
-    Raises:
-        RequestError: the request is wrong. ReconstructionError: the data can't be reconstructed.
-        StageError: a fault of ours.
-    """
-    request = make_request(images, workspace, preset, overrides, stages, from_stage)
-    config = load_config(request.preset, request.overrides)
-    return Runner(request, config, reporter or Reporter()).run(force=force, dry_run=dry_run)
-
-
 class Runner:
     """One request on one workspace."""
 
@@ -165,63 +160,27 @@ class Runner:
 
     def plan(self) -> list[PlannedStage]:
         """Look at every stage without running any."""
-        table = provider_table(self.chain, self.store)
-        planned = []
-        for name in self.chain.names:
-            stage = plan_stage(name, self.config, self.store, table, self.request.images)
-            planned.append(stage)
-            if stage.result is not None:
-                made = tuple(stage.result.contents)
-            else:
-                made = (*get_stage(name).provides, *get_stage(name).may_provide)
-            for kind in made:
-                table[kind] = Input(name, kind, stage.result)
-        return planned
+        return plan_chain(self.chain, self.config, self.store, self.request.images)
 
-    def run(self, *, force: bool = False, dry_run: bool = False) -> RunSummary:
-        if dry_run:
-            return self._dry_run(force)
+    def run(self, *, force: bool = False) -> RunSummary:
+        """Run the chain, reusing what is still valid.
+
+        Raises:
+            RequestError: the request is wrong; nothing was written, or the disk is full.
+            ReconstructionError: the data can't be reconstructed. StageError: a fault of ours.
+        """
         self.plan()  # a wrong request is refused before anything is written
         self.store.create()
         self.request.save()
         self.reporter.start(list(self.chain.names))
         try:
             self._check_upstream()
-            summary = self._run_all(force)
-            summary.report = self._write_report()
-            summary.check = self._check_page() if summary.report else None
-            return summary
-        except (ReconstructionError, StageError) as error:
-            report = self._write_report()
-            if report is not None:
-                self.reporter.message(f"What came of it so far: {report}")
-            page = self._check_page() if report else None
-            if page and isinstance(error, ReconstructionError) and error.artifacts:
-                error.args = (f"{error} To put it right, open {page} in a browser.",)
-            raise
+            return self._run_all(force)
         finally:
             self.reporter.stop()
 
-    def _write_report(self) -> Path | None:
-        """Write the report; whatever goes wrong with it is said, and harms nothing else."""
-        if not self.config.run.report:
-            return None
-        from pipeline.report import run_report
-
-        try:
-            return run_report(self.request.workspace)
-        except Exception as error:
-            self.reporter.message(f"The report could not be written: {error}")
-            return None
-
-    def _check_page(self) -> Path | None:
-        """The page to put the teeth right, where the report wrote one."""
-        from pipeline.report import CHECK
-
-        page = self.request.workspace / CHECK
-        return page if page.is_file() else None
-
-    def _dry_run(self, force: bool) -> RunSummary:
+    def dry_run(self, *, force: bool = False) -> RunSummary:
+        """Only say what would be done."""
         summary = RunSummary(self.request.workspace)
         for stage in self.plan():
             forced = force and stage.name not in self.chain.implicit
@@ -346,6 +305,12 @@ class Runner:
         except Exception as error:
             raise self._explain_failure(error, name, key) from error
 
+    def _thrift(self) -> list[str]:
+        """What the stages of this run know to do where memory runs out."""
+        found = usable_stages()
+        names = (*self.chain.upstream, *self.chain.names)
+        return [found[name].thrift for name in names if name in found and found[name].thrift]
+
     def _explain_failure(self, error: Exception, name: str, key: str) -> PipelineError:
         """Turn any failure into one paragraph, and leave the store as it was."""
         if is_disk_full(error, self.request.workspace):
@@ -360,8 +325,7 @@ class Runner:
             failure = error
         elif isinstance(error, MemoryError):
             failure = StageError(
-                f"The stage '{name}' needs more memory than there is. Use fewer photographs "
-                "(--frames) or a smaller working size (--set views.long_side=384)."
+                " ".join([f"The stage '{name}' needs more memory than there is.", *self._thrift()])
             )
         else:
             where = traceback.extract_tb(error.__traceback__)[-1]

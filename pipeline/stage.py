@@ -8,19 +8,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.artifacts import Artifact, artifact_class
+from pipeline.artifacts import GROUP as ARTIFACTS
+from pipeline.artifacts import KINDS, Artifact, artifact_class, kinds
 from pipeline.errors import RequestError, nearest
+from pipeline.plugins import Entries, check_name, load, registered
 
 if TYPE_CHECKING:
-    from pipeline.checkup import Finding
+    from pipeline.pages.case import Case
+    from pipeline.pages.parts import Part
 
-ENTRY_POINT_GROUP = "dentalsplat.stages"
+#: Entry points of this group are the stages.
+GROUP = "dentalsplat.stages"
+#: Names that mean something else in a preset or in a workspace.
+TAKEN = ("compare", "extends", "report", "results", "run", "seed", "stages", "threads")
+
+#: Name of a part of the page about a run -> what draws it.
+Parts = Mapping[str, "Callable[[Case], Iterable[Part]]"]
 
 
 class StageConfig(BaseModel):
@@ -81,6 +89,21 @@ class StageContext(ABC):
         """Record figures for the run's summary and the manifest (counts, errors; no timings)."""
 
 
+@dataclass
+class Finding:
+    """One thing that was checked.
+
+    Attributes:
+        level: ``ok``, ``note`` (works, but could be better) or ``problem`` (a run would fail).
+        mend: what to do about it, where there is something to do.
+    """
+
+    name: str
+    level: str
+    detail: str
+    mend: str = ""
+
+
 class Stage(ABC):
     """One step of the pipeline: artifacts in, artifacts out.
 
@@ -101,6 +124,7 @@ class Stage(ABC):
         uses_sources: True for a stage that reads the photographs (they are part of its key).
         prepares: True for a quick stage that only says more of the photographs: it runs whenever
             they are named, even where the stages named leave it out.
+        thrift: what a user can do where memory runs out, in a sentence.
     """
 
     name: ClassVar[str]
@@ -115,6 +139,7 @@ class Stage(ABC):
     methods: ClassVar[Mapping[str, str]] = {}
     uses_sources: ClassVar[bool] = False
     prepares: ClassVar[bool] = False
+    thrift: ClassVar[str] = ""
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
         """Name the user's files that the stage will read: their content enters its key.
@@ -132,6 +157,14 @@ class Stage(ABC):
     def findings(self) -> Iterable[Finding]:
         """What `pipeline doctor` should say of this stage: optional parts that are there or not."""
         return ()
+
+    def report(self) -> Parts:
+        """What the page about a run says of this stage (`pipeline.pages.parts`).
+
+        Each part is drawn by itself, so that a damaged file costs no other. What draws them lies in
+        a module of its own, imported here.
+        """
+        return {}
 
     @abstractmethod
     def run(self, context: StageContext) -> None:
@@ -187,9 +220,8 @@ class LocalContext(StageContext):
         return artifact_class(kind).load(self.folder / kind)
 
 
-@cache
-def _entry_points() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
+def _entry_points() -> Entries:
+    return registered(GROUP)
 
 
 def stage_names() -> list[str]:
@@ -211,7 +243,7 @@ def get_stage(name: str) -> Stage:
     """Return the registered stage of a name.
 
     Raises:
-        RequestError: there is none, or its package can't be imported.
+        RequestError: there is none, two packages register it, or it can't be used.
     """
     found = _entry_points()
     if not found:
@@ -222,12 +254,54 @@ def get_stage(name: str) -> Stage:
     if name not in found:
         known = ", ".join(sorted(found))
         raise RequestError(f"Unknown stage '{name}'. The stages are {known}.{nearest(name, found)}")
+    stage: type[Stage]
+    stage, where = load(f"stage '{name}'", found[name], Stage)
+    _check(stage, name, where)
     try:
-        stage = found[name].load()()
-    except ImportError as error:
+        return stage()
+    except Exception as error:
         raise RequestError(
-            f"The stage '{name}' ({found[name].value}) can't be imported: {error}. Run 'pipeline "
-            "doctor' to see what is missing."
+            f"{where} can't be made: {type(error).__name__}: {error}. A stage is made without "
+            "arguments, and does nothing yet."
         ) from error
-    assert isinstance(stage, Stage), f"{found[name].value} is not a pipeline.stage.Stage"
-    return stage
+
+
+def _check(stage: type[Stage], name: str, where: str) -> None:
+    """Does a stage say of itself all that the engine asks?
+
+    Raises:
+        RequestError: it does not; `where` begins the message.
+    """
+    check_name(where, "name", getattr(stage, "name", None), name, TAKEN)
+    asked = {"version": (int, "a whole number"), "summary": (str, "one line of text")}
+    for attribute, (kind, told) in asked.items():
+        if not isinstance(getattr(stage, attribute, None), kind):
+            raise RequestError(f"{where} has no {attribute}. Set it to {told} in the class.")
+    config = getattr(stage, "Config", None)
+    if not (isinstance(config, type) and issubclass(config, StageConfig)):
+        raise RequestError(
+            f"{where} has no Config. Set it to its settings, a class derived from "
+            "pipeline.stage.StageConfig."
+        )
+    for setting, field_info in config.model_fields.items():
+        if field_info.is_required():
+            raise RequestError(
+                f"{where} has the setting '{setting}' without a default. Give it one: runs without "
+                "this stage have settings for it too."
+            )
+    known = kinds()
+    for attribute in ("requires", "optional", "provides", "may_provide"):
+        named = getattr(stage, attribute)
+        if isinstance(named, str) or not all(isinstance(kind, str) for kind in named):
+            raise RequestError(
+                f"{where} has {attribute} = {named!r}. Set it to a tuple of kinds of artifact."
+            )
+        for kind in named:
+            if kind not in known:
+                raise RequestError(
+                    f"{where} names '{kind}' in {attribute}, a kind of artifact that nobody "
+                    f"registered; the kinds are {', '.join(known)}.{nearest(kind, known)} Register "
+                    f"its class under that name in the entry points of '{ARTIFACTS}'."
+                )
+            if kind not in KINDS or len(known[kind]) > 1:
+                artifact_class(kind)  # one that can't be used is said before any work is done

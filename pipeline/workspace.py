@@ -1,20 +1,109 @@
-"""The state of a workspace, the registered stages, and cleaning up."""
+"""A workspace: what was asked of it, how its stages stand, and cleaning it up."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.config import load_config
-from pipeline.errors import PipelineError, RequestError
-from pipeline.files import read_json
-from pipeline.progress import Reporter
-from pipeline.request import make_request
-from pipeline.runner import Runner
-from pipeline.stage import get_stage, stage_names
+from pipeline.errors import RequestError
+from pipeline.files import read_json, write_json
+from pipeline.planning import plan_chain, resolve_chain
 from pipeline.store import Store
+
+#: Folders that say nothing about the case inside them; their parent's name does.
+GENERIC_FOLDERS = {"images", "image", "frames", "photos", "photographs", "input", "inputs", "rgb"}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for: photographs, preset and overrides, stages.
+
+    Attributes:
+        images: the photographs that the user named, or those that the workspace was last run on.
+        images_named: whether the user named them.
+    """
+
+    workspace: Path
+    images: tuple[str, ...]
+    preset: str | None
+    overrides: tuple[str, ...]
+    stages: tuple[str, ...] | None
+    from_stage: str | None = None
+    images_named: bool = True
+
+    def save(self) -> None:
+        """Remember the request in the workspace, for `status` and for runs that name no images."""
+        entry = {
+            "images": list(self.images),
+            "preset": self.preset,
+            "overrides": list(self.overrides),
+            "stages": list(self.stages) if self.stages else None,
+            "from": self.from_stage,
+        }
+        path = self.workspace / "request.json"
+        if read_json(path) != entry:
+            write_json(path, entry)
+
+
+def make_request(
+    images: Sequence[str | Path] | str | Path = (),
+    workspace: str | Path | None = None,
+    preset: str | Path | None = None,
+    overrides: Iterable[str] | Mapping[str, Any] = (),
+    stages: Sequence[str] | None = None,
+    from_stage: str | None = None,
+) -> Request:
+    """Complete what the user said with what the workspace remembers (its photographs)."""
+    given = [images] if isinstance(images, str | Path) else list(images)
+    if workspace is None:
+        workspace = default_workspace(given)
+    folder = Path(workspace)
+    images_named = bool(given)
+    if not given:
+        remembered = read_json(folder / "request.json") or {}
+        given = [p for p in remembered.get("images", []) if _still_there(p)]
+    if isinstance(overrides, Mapping):
+        overrides = [f"{key}={_yaml_value(value)}" for key, value in overrides.items()]
+    return Request(
+        workspace=folder,
+        images=tuple(os.path.abspath(p) for p in given),  # noqa: PTH100 - keeps glob characters
+        preset=str(preset) if preset is not None else None,
+        overrides=tuple(overrides),
+        stages=tuple(stages) if stages else None,
+        from_stage=from_stage,
+        images_named=images_named,
+    )
+
+
+def _still_there(path: str) -> bool:
+    return any(c in path for c in "*?[") or Path(path).exists()
+
+
+def _yaml_value(value: Any) -> str:
+    import yaml
+
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def default_workspace(images: Sequence[str | Path]) -> Path:
+    """``./runs/<name of the input>``; a folder called "images" or "frames" lends its parent's."""
+    if not images:
+        raise RequestError("Give the photographs (a folder, files or a video), or a workspace: -w.")
+    first = Path(images[0])
+    single = len(images) == 1
+    if single and first.is_dir():
+        folder = first.resolve()
+    elif single and not any(c in first.name for c in "*?["):
+        return Path("runs") / first.stem
+    else:
+        folder = first.resolve().parent
+    name = folder.parent.name if folder.name.lower() in GENERIC_FOLDERS else folder.name
+    return Path("runs") / (name or "case")
 
 
 @dataclass
@@ -68,10 +157,11 @@ def status(
         stages or remembered["stages"],
     )
     config = load_config(request.preset, request.overrides)
-    runner = Runner(request, config, Reporter())
+    store = Store(request.workspace)
+    chain = resolve_chain(config, request.stages, request.from_stage, request.images_named, store)
     found = []
-    for plan in runner.plan():
-        result = plan.result or runner.store.current(plan.name)
+    for plan in plan_chain(chain, config, store, request.images):
+        result = plan.result or store.current(plan.name)
         found.append(
             StageStatus(
                 name=plan.name,
@@ -83,33 +173,6 @@ def status(
                 resumable=plan.resumable,
                 summary=result.manifest["summary"] if result else {},
             )
-        )
-    return found
-
-
-def stages() -> list[dict[str, Any]]:
-    """The registered stages: what each requires and provides, its methods and its settings."""
-    order = list(load_config().run.stages)
-    names = sorted(stage_names(), key=lambda n: (order.index(n) if n in order else len(order), n))
-    found: list[dict[str, Any]] = []
-    for name in names:
-        try:
-            stage = get_stage(name)
-        except PipelineError as error:
-            found.append({"name": name, "error": str(error)})
-            continue
-        found.append(
-            {
-                "name": name,
-                "summary": stage.summary,
-                "version": stage.version,
-                "requires": list(stage.requires),
-                "optional": list(stage.optional),
-                "provides": list(stage.provides),
-                "may_provide": list(stage.may_provide),
-                "methods": dict(stage.methods),
-                "settings": stage.Config.model_json_schema(),
-            }
         )
     return found
 

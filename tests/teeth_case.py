@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.artifacts.fdi import Jaw, is_upper
+from pipeline.artifacts.dental.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from stages.dentition.crowns import Outline, dentition_of

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifacts.views import write_png
-from pipeline.benchmarking.suite import Suite
-from pipeline.benchmarking.tables import build_table, paper_note
-from pipeline.report import benchmark_report
-from pipeline.report.benchmark import charts, grid_table, groups
+from pipeline.studies.benchmark.report import benchmark_report, charts, grid_table, groups
+from pipeline.studies.benchmark.suite import Suite
+from pipeline.studies.benchmark.tables import build_table, paper_note
 from stages.evaluate.pictures import comparison
 from tests import report_case as case
 from tests.browser import needs_chromium

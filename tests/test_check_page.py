@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.artifacts.corrections import Corrections, read_corrections
+from pipeline.artifacts.dental.corrections import Corrections, read_corrections
 from pipeline.artifacts.teeth import Teeth
-from pipeline.report import run_report
 from pipeline.store import Store
+from pipeline.studies.report import run_report
 from stages.dentition.corrections import apply_corrections
 from stages.dentition.crowns import mirrored_dentition
 from tests import teeth_case as case

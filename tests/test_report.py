@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 import pipeline
+from pipeline.artifacts.metrics import Scores
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.world import move_camera
-from pipeline.report import run_report
-from pipeline.report.geometry import movement, similarity_onto
-from pipeline.report.pictures import flow_colors, picture, points_image, thirds
-from pipeline.report.tables import views_table
+from pipeline.pages.directions import movement, similarity_onto
+from pipeline.pages.pictures import picture, points_image, thirds
+from pipeline.pages.tables import views_table
 from pipeline.runner import RunSummary
+from pipeline.studies.report import run_report
 from stages.evaluate.pictures import comparison
+from stages.flow.report import flow_colors
 from tests import report_case as case
 from tests.browser import browse, needs_chromium
 from tests.report_page import assert_alone, look, text_of
@@ -162,7 +164,7 @@ def test_pictures_are_scaled_down_and_described() -> None:
 
 
 def test_columns_without_figures_are_left_out() -> None:
-    block = case.scored(["000", "001"], 20.0)
+    block = Scores.of(case.scored(["000", "001"], 20.0))
     table = views_table(block, {"000": "first"})
     assert table.head == ["view", "PSNR dB", "SSIM", "covered %", "pixels scored %"]
     assert [cell.text for cell in table.rows[0]] == ["first", "20.00", "0.800", "97.0", "100.0"]

@@ -1,5 +1,5 @@
 """Typed artifacts: what the stages hand to each other, in formats that other tools open."""
 
-from pipeline.artifacts.base import KINDS, Artifact, artifact_class
+from pipeline.artifacts.base import GROUP, KINDS, Artifact, artifact_class, kinds
 
-__all__ = ["KINDS", "Artifact", "artifact_class"]
+__all__ = ["GROUP", "KINDS", "Artifact", "artifact_class", "kinds"]

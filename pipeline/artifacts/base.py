@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import ClassVar, Self
 
 from pipeline.errors import RequestError, nearest
+from pipeline.plugins import check_name, load, registered
 
-#: kind -> where its class lives. Imported on first use, so that listing the kinds costs nothing.
+#: Entry points of this group add kinds.
+GROUP = "dentalsplat.artifacts"
+#: What lies beside the folders of a result's kinds.
+TAKEN = ("scratch",)
+
+#: The kinds of this project: where each class lives. Imported on first use, so that listing the
+#: kinds costs nothing.
 KINDS: dict[str, str] = {
     "views": "pipeline.artifacts.views:Views",
     "held_out": "pipeline.artifacts.views:HeldOut",
@@ -44,18 +52,31 @@ class Artifact(ABC):
         """Read the artifact back from `folder`."""
 
 
+def kinds() -> dict[str, Sequence[EntryPoint]]:
+    """Kind -> where it is registered: those of this project, and entry points of `GROUP`."""
+    found: dict[str, Sequence[EntryPoint]] = {
+        kind: [EntryPoint(kind, where, GROUP)] for kind, where in KINDS.items()
+    }
+    for kind, entries in registered(GROUP).items():
+        known = found.get(kind, ())
+        values = [entry.value for entry in known]
+        found[kind] = [*known, *(entry for entry in entries if entry.value not in values)]
+    return found
+
+
 def artifact_class(kind: str) -> type[Artifact]:
     """Return the class of an artifact kind.
 
     Raises:
-        RequestError: `kind` is not a known kind.
+        RequestError: nobody registers the kind, two do, or its class can't be used.
     """
-    try:
-        module, name = KINDS[kind].split(":")
-    except KeyError:
+    known = kinds()
+    if kind not in known:
         raise RequestError(
-            f"Unknown artifact kind '{kind}'; the kinds are {', '.join(KINDS)}."
-            f"{nearest(kind, KINDS)}"
-        ) from None
-    loaded: type[Artifact] = getattr(importlib.import_module(module), name)
-    return loaded
+            f"Unknown artifact kind '{kind}'; the kinds are {', '.join(known)}."
+            f"{nearest(kind, known)}"
+        )
+    found: type[Artifact]
+    found, where = load(f"kind of artifact '{kind}'", known[kind], Artifact)
+    check_name(where, "kind", getattr(found, "kind", None), kind, TAKEN)
+    return found

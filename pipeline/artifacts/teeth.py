@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.base import Artifact
-from pipeline.artifacts.fdi import JAWS, Jaw, universal_number
+from pipeline.artifacts.dental.fdi import JAWS, Jaw, universal_number
 from pipeline.artifacts.views import read_png, write_png
 
 Point = npt.NDArray[np.float64]  # [2] x, y in pixels of the working image, pixel centres at .5

@@ -8,8 +8,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.corrections import Corrections, CrownCorrection, PhotoCorrection, Place
-from pipeline.artifacts.fdi import Jaw, is_upper
+from pipeline.artifacts.dental.corrections import (
+    Corrections,
+    CrownCorrection,
+    PhotoCorrection,
+    Place,
+)
+from pipeline.artifacts.dental.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, Jaw, other_side
+from pipeline.artifacts.dental.fdi import JAWS, Jaw, other_side
 from pipeline.artifacts.teeth import Crown, Dentition
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import permanent_of
+from pipeline.artifacts.dental.fdi import permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition, Point
 
 Picture = npt.NDArray[np.uint8]  # [H, W, 3] sRGB

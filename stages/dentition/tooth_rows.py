@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw, permanent_of, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, permanent_of, teeth_of
 
 Array = npt.NDArray[np.float64]
 Labels = tuple[int, ...]

@@ -131,8 +131,8 @@ def common_lens(views: Sequence[View]) -> str | None:
 
 def without_lens(view: View, lens: str) -> View:
     """A photograph with the distortion of a lens (`View.lens_taken_out`) taken out of it."""
-    from pipeline.geometry.colmap import quiet_pycolmap
-    from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
+    from pipeline.geometry.models.colmap import quiet_pycolmap
+    from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 
     model, width, height, *parameters = lens.split()
     camera = quiet_pycolmap().Camera(

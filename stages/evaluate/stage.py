@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RequestError
-from pipeline.stage import Stage, StageContext
+from pipeline.stage import Parts, Stage, StageContext
 from stages.evaluate.config import EvaluateConfig
 
 #: Suffixes of masks.
@@ -30,7 +30,7 @@ class EvaluateStage(Stage):
     )  # fmt: skip
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from pipeline.geometry.known_cameras import model_files
+        from pipeline.geometry.models.known_cameras import model_files
         from stages.evaluate.perceptual import find_vgg_weights
 
         found: dict[str, Path] = {}
@@ -45,6 +45,11 @@ class EvaluateStage(Stage):
         if weights is not None:
             found[f"lpips/vgg16{weights.suffix}"] = weights
         return found
+
+    def report(self) -> Parts:
+        from stages.evaluate.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         from stages.evaluate.evaluation import evaluate

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from pipeline.geometry.known_cameras import matching_cameras, pinhole_camera, read_cameras
+from pipeline.geometry.models.known_cameras import matching_cameras, pinhole_camera, read_cameras
 from stages.evaluate.held_out import without_lens
 
 Mask = npt.NDArray[np.bool_]

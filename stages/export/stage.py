@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
-from pipeline.stage import Stage, StageConfig, StageContext
+from pipeline.stage import Parts, Stage, StageConfig, StageContext
 
 if TYPE_CHECKING:
     from pipeline.artifacts.teeth import Teeth
@@ -101,6 +101,11 @@ class ExportStage(Stage):
         "pymeshlab",
         "scipy",
     )
+
+    def report(self) -> Parts:
+        from stages.export.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.gaussians import write_gaussians_ply

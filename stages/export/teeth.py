@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.fdi import is_primary, is_upper, universal_number
+from pipeline.artifacts.dental.fdi import is_primary, is_upper, universal_number
 from pipeline.artifacts.teeth import Dentition, Teeth, filled
 from pipeline.artifacts.views import View, Views
 from stages.splatting.rendering import RenderedView
@@ -138,8 +138,8 @@ def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array
     scaled = outline * (np.array([view.width, view.height]) / np.array(size))
     if not view.lens_taken_out:
         return np.asarray(scaled, np.float64)
-    from pipeline.geometry.colmap import quiet_pycolmap
-    from pipeline.geometry.known_cameras import (
+    from pipeline.geometry.models.colmap import quiet_pycolmap
+    from pipeline.geometry.models.known_cameras import (
         KnownCamera,
         pinhole_camera,
         working_pixels_from_lens,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Iterable
+from pathlib import Path
 from typing import ClassVar
 
 from pipeline.artifacts.cameras import Cameras
@@ -10,7 +13,7 @@ from pipeline.artifacts.flow import Flow
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
-from pipeline.stage import Stage, StageConfig, StageContext
+from pipeline.stage import Finding, Parts, Stage, StageConfig, StageContext
 from stages.fit.config import FitConfig
 
 
@@ -31,6 +34,19 @@ class FitStage(Stage):
         "opencv-contrib-python-headless",
         "scipy",
     )
+
+    def findings(self) -> Iterable[Finding]:
+        kernels = Path(__file__).resolve().parents[1] / "splatting"
+        kept = os.access(kernels, os.W_OK) or bool(os.environ.get("NUMBA_CACHE_DIR"))
+        yield Finding(
+            "kernel cache", "ok" if kept else "note",
+            "compiled kernels are kept" if kept else "kernels are kept in your home folder",
+        )  # fmt: skip
+
+    def report(self) -> Parts:
+        from stages.fit.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         from stages.fit.fitting import fit

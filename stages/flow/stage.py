@@ -13,7 +13,7 @@ from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
-from pipeline.stage import Stage, StageConfig, StageContext
+from pipeline.stage import Parts, Stage, StageConfig, StageContext
 
 #: Trusted shares below this are worth a word to the user.
 _POOR_SHARE = 0.1
@@ -101,6 +101,11 @@ class FlowStage(Stage):
         "dis": "Dense Inverse Search (Kroeger et al. 2016): fast, the default",
         "farneback": "polynomial expansion (Farnebäck 2003)",
     }
+
+    def report(self) -> Parts:
+        from stages.flow.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         import cv2

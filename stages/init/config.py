@@ -21,6 +21,9 @@ REFINEMENT = RefinementOptions()
 SURFACE = SurfaceOptions()
 POINTMAPS = PointmapOptions()
 
+#: The setting that names cameras known beforehand, for messages.
+CAMERAS = "init.cameras"
+
 
 class DenseConfig(StageConfig):
     """Dense stereo."""

@@ -9,10 +9,10 @@ import numpy as np
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
-from pipeline.geometry.model_points import as_points, read_model_points
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.models.model_points import as_points, read_model_points
 from pipeline.stage import StageContext
-from stages.init.config import InitConfig
+from stages.init.config import CAMERAS, InitConfig
 from stages.init.place import photo_name
 from stages.init.placement import Placement
 from stages.init.write import save_all
@@ -46,7 +46,9 @@ def from_model(
             f"The model {config.cameras} has cameras but no points to start from. Leave "
             "init.points=model out, so that dense stereo finds them."
         )
-    pairs = [as_pinhole(view, known[view.name]) for view in views.views if view.name in known]
+    pairs = [
+        as_pinhole(view, known[view.name], CAMERAS) for view in views.views if view.name in known
+    ]
     placement = Placement(
         views=tuple(view for view, _ in pairs), cameras=tuple(camera for _, camera in pairs),
         points=sparse.positions,

@@ -13,7 +13,8 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.graph import Pair
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole, rounded
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole, rounded
+from stages.init.config import CAMERAS
 from stages.init.placement import Placement
 from stages.init.sfm.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
 from stages.init.sfm.matching.pictures import Links, match_pictures
@@ -150,7 +151,7 @@ def place_known(
     without = [photo_name(view) for view in views if view.name not in known]
     if without:
         warn(f"The model has no camera of {', '.join(without)}; left out.")
-    pairs = [as_pinhole(view, known[view.name]) for view in views if view.name in known]
+    pairs = [as_pinhole(view, known[view.name], CAMERAS) for view in views if view.name in known]
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
     features = find_features(
         [view.gray() for view in placed], [view.valid() for view in placed], options, threads,

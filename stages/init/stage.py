@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.stage import Stage, StageContext
-from stages.init.config import InitConfig
+from pipeline.stage import Parts, Stage, StageContext
+from stages.init.config import CAMERAS, InitConfig
 
 if TYPE_CHECKING:
-    from pipeline.checkup import Finding
-    from pipeline.geometry.known_cameras import KnownCamera
+    from pipeline.geometry.models.known_cameras import KnownCamera
+    from pipeline.stage import Finding
     from stages.init.sfm.options import ClassicalOptions
     from stages.pointmaps.options import PointmapOptions
 
@@ -52,21 +52,21 @@ class InitStage(Stage):
     }
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from pipeline.artifacts.corrections import (
+        from pipeline.artifacts.dental.corrections import (
             CORRECTIONS,
             corrections_file,
             read_corrections,
         )
 
         files = dict(_inputs(config))
-        said = corrections_file(config.dental.labels, request)
+        said = corrections_file(config.dental.labels, request, "init.dental.labels")
         if said:
             read_corrections(said)  # a wrong file is said before any work is done
             files[CORRECTIONS] = said
         return files
 
     def findings(self) -> Iterable[Finding]:
-        from pipeline.checkup import Finding
+        from pipeline.stage import Finding
         from stages.pointmaps.predict import available, cards
 
         installed = set(available())
@@ -79,6 +79,11 @@ class InitStage(Stage):
                 f"--set init.method={card.name} --set init.pointmap.checkpoint=FILE" if there
                 else card.install,
             )  # fmt: skip
+
+    def report(self) -> Parts:
+        from stages.init.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         """Place the views, densify, and write what came out.
@@ -106,7 +111,7 @@ class InitStage(Stage):
 
 def _inputs(config: InitConfig) -> Mapping[str, Path]:
     """The files that the settings name: cameras, or pointmaps and weights."""
-    from pipeline.geometry.known_cameras import model_files
+    from pipeline.geometry.models.known_cameras import model_files
 
     if config.cameras is not None:
         if config.method not in ("auto", "known", "dental"):
@@ -114,7 +119,7 @@ def _inputs(config: InitConfig) -> Mapping[str, Path]:
                 f"init.cameras is given, but init.method={config.method} would not use it. "
                 "Leave one of them out."
             )
-        files = model_files(Path(config.cameras))
+        files = model_files(Path(config.cameras), CAMERAS)
         if config.points == "model" and not any("points3D" in label for label in files):
             raise RequestError(
                 f"init.points=model: {config.cameras} holds no points. Give the folder of a "
@@ -141,7 +146,7 @@ def _inputs(config: InitConfig) -> Mapping[str, Path]:
 
 def _camera_files(sources: Mapping[str, Path]) -> list[Path]:
     """The sources without what a person has said of the teeth."""
-    from pipeline.artifacts.corrections import CORRECTIONS
+    from pipeline.artifacts.dental.corrections import CORRECTIONS
 
     return [path for label, path in sources.items() if label != CORRECTIONS]
 
@@ -249,13 +254,13 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
-    from pipeline.geometry.known_cameras import matching_cameras, read_cameras
+    from pipeline.geometry.models.known_cameras import matching_cameras, read_cameras
     from stages.init.place import place_known
     from stages.init.write import densify
 
     config: InitConfig = context.config
-    cameras, units = read_cameras(_camera_files(context.sources))
-    known = matching_cameras(cameras, views.views)
+    cameras, units = read_cameras(_camera_files(context.sources), CAMERAS)
+    known = matching_cameras(cameras, views.views, CAMERAS)
     units = units if config.units == "auto" else config.units
     if config.points == "model":
         from stages.init.model_start import from_model
@@ -287,14 +292,14 @@ def _teeth_are_wide_apart(
     context: StageContext, views: Views, known: dict[str, KnownCamera]
 ) -> bool:
     """Few photographs of teeth with known cameras, too far apart for dense stereo."""
-    from pipeline.geometry.known_cameras import pinhole_camera
+    from pipeline.geometry.models.known_cameras import pinhole_camera
     from stages.init.dental.place_known import neighbour_angle
 
     config: InitConfig = context.config
     if config.dense.method != "auto":
         return False
     posed = tuple(view for view in views.views if view.name in known)
-    angle = neighbour_angle([pinhole_camera(view, known[view.name]) for view in posed])
+    angle = neighbour_angle([pinhole_camera(view, known[view.name], CAMERAS) for view in posed])
     wide = angle > config.dental.wide_angle
     return wide and _teeth_are_worth_a_try(context, replace(views, views=posed))
 

@@ -42,7 +42,7 @@ class SwapStage(Stage):
     libraries: ClassVar[tuple[str, ...]] = ("pycolmap", "numpy")
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        from pipeline.geometry.known_cameras import model_files
+        from pipeline.geometry.models.known_cameras import model_files
 
         if config.cameras is None:
             raise RequestError(
@@ -61,7 +61,11 @@ class SwapStage(Stage):
         from dataclasses import replace
 
         from pipeline.artifacts.cameras import Cameras
-        from pipeline.geometry.known_cameras import matching_cameras, pinhole_camera, read_cameras
+        from pipeline.geometry.models.known_cameras import (
+            matching_cameras,
+            pinhole_camera,
+            read_cameras,
+        )
         from pipeline.geometry.world import move_camera, similarity_between
 
         config: SwapConfig = context.config

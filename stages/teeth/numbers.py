@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw, primary_of, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, primary_of, teeth_of
 
 Array = npt.NDArray[np.float64]
 

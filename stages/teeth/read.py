@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import softmax
 
-from pipeline.artifacts.fdi import JAWS, Jaw, primary_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.crowns import Outline, centroid, dentition_of, row_roll
 from stages.dentition.tooth_rows import (

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from pipeline.errors import RequestError
-from pipeline.stage import Stage, StageConfig, StageContext, runtime
+from pipeline.stage import Parts, Stage, StageConfig, StageContext, runtime
 from stages.views.find import MASK_PREFIX, find_images, find_masks, held_labels, is_video
 from stages.views.sampling import is_sequence, uniform_indices
 
@@ -57,6 +57,9 @@ class ViewsStage(Stage):
         "av", "opencv-contrib-python-headless", "pillow", "pillow-heif",
     )  # fmt: skip
     uses_sources: ClassVar[bool] = True
+    thrift: ClassVar[str] = (
+        "Use fewer photographs (--frames) or a smaller working size (--set views.long_side=384)."
+    )
 
     def sources(self, config: ViewsConfig, request: Mapping[str, Any]) -> Mapping[str, Path]:
         files = find_images(request["images"])
@@ -69,6 +72,11 @@ class ViewsStage(Stage):
             f"{MASK_PREFIX}{masks[label].name}": masks[label] for label in chosen if label in masks
         }
         return {label: files[label] for label in chosen} | named
+
+    def report(self) -> Parts:
+        from stages.views.report import PARTS
+
+        return PARTS
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.views import HeldOut, Views

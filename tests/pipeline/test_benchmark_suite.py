@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.benchmarking.cells import Cell, plan_cells
-from pipeline.benchmarking.splits import pictures_of, split_views
-from pipeline.benchmarking.suite import Suite, load_suite, suites
 from pipeline.config import read_yaml, validate
 from pipeline.errors import RequestError
+from pipeline.studies.benchmark.cells import Cell, plan_cells
+from pipeline.studies.benchmark.splits import pictures_of, split_views
+from pipeline.studies.benchmark.suite import Suite, load_suite, suites
 
 SUITE: dict[str, Any] = {
     "title": "A title",

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.benchmarking.paper import ABLATIONS, PHOTOS, VIEWS, paper_figures
-from pipeline.benchmarking.statistics import compare, figure_of, summarise
-from pipeline.benchmarking.suite import Suite
-from pipeline.benchmarking.tables import build_table, paper_note
-from pipeline.benchmarking.writing import csv_text, grid_markdown, markdown
+from pipeline.studies.benchmark.paper import ABLATIONS, PHOTOS, VIEWS, paper_figures
+from pipeline.studies.benchmark.statistics import compare, figure_of, summarise
+from pipeline.studies.benchmark.suite import Suite
+from pipeline.studies.benchmark.tables import build_table, paper_note
+from pipeline.studies.benchmark.writing import csv_text, grid_markdown, markdown
 
 
 def record(method: str, views: int = 3, scene: str = "a", **more: Any) -> dict[str, Any]:

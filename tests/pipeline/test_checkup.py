@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline import checkup
+from pipeline.front import checkup
 
 
 def by_name(findings: list[checkup.Finding]) -> dict[str, checkup.Finding]:

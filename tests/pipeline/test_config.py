@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import load_config, parse_override, presets, result_fields
 from pipeline.errors import RequestError
-from pipeline.request import _yaml_value
+from pipeline.workspace import _yaml_value
 
 
 def test_override_reaches_the_stage(toys: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import pipeline
-from pipeline.artifacts.corrections import (
+from pipeline.artifacts.dental.corrections import (
     Corrections,
     CrownCorrection,
     PhotoCorrection,
@@ -173,7 +173,7 @@ def test_where_the_file_is(tmp_path: Path) -> None:
     other = case.write(tmp_path / "mine.yaml", "")
     assert corrections_file(str(other), request) == other
     with pytest.raises(RequestError, match=r"init.dental.labels: there is no file .*none.yaml"):
-        corrections_file(str(tmp_path / "none.yaml"), request)
+        corrections_file(str(tmp_path / "none.yaml"), request, "init.dental.labels")
 
 
 def applied(teeth: Teeth | None = None, **photographs: PhotoCorrection) -> tuple[Dentition, ...]:
@@ -371,7 +371,7 @@ def test_what_a_failed_stage_made_is_kept_until_one_succeeds(
             raise ReconstructionError("Doubtful.", picture if how == "drawn" else {}, made)
 
     monkeypatch.setattr(toy.CountStage, "_maybe_fail", doubtful)
-    monkeypatch.setattr("pipeline.report.check._views_of", lambda found: case.views())
+    monkeypatch.setattr("pipeline.studies.report.check._views_of", lambda found: case.views())
     with pytest.raises(ReconstructionError, match=r"Pictures .* To put it right, open .*check"):
         run("count.fail=drawn")
     folder = toys / "w" / "count" / "failure"

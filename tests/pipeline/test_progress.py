@@ -6,8 +6,8 @@ import io
 
 from rich.console import Console
 
-from pipeline import progress
-from pipeline.progress import LineReporter, LiveReporter, Pace, describe
+from pipeline.front import progress
+from pipeline.front.progress import LineReporter, LiveReporter, Pace, describe
 
 
 def test_time_left() -> None:

@@ -12,7 +12,7 @@ import pytest
 import pipeline
 from pipeline.cli import app
 from pipeline.config import load_config
-from pipeline.progress import Reporter
+from pipeline.runner import Reporter
 
 
 class Listener(Reporter):
@@ -85,7 +85,7 @@ def test_a_fault_of_the_report_is_a_message(toys: Path, monkeypatch: pytest.Monk
     def broken(workspace: Path) -> Path:
         raise ZeroDivisionError("oops")
 
-    monkeypatch.setattr("pipeline.report.run_report", broken)
+    monkeypatch.setattr("pipeline.studies.report.run_report", broken)
     listener = Listener()
     summary = start(toys, reporter=listener)
     assert summary.report is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts import artifact_class
-from pipeline.artifacts.fdi import (
+from pipeline.artifacts.dental.fdi import (
     ALL_TEETH,
     JAWS,
     is_left,

@@ -147,7 +147,7 @@ class ToyEntryPoint:
         return self._stage
 
 
-STAGES = {s.name: ToyEntryPoint(s) for s in (ReadStage, ScaleStage, CountStage, PublishStage)}
+STAGES = {s.name: [ToyEntryPoint(s)] for s in (ReadStage, ScaleStage, CountStage, PublishStage)}
 ORDER = ["read", "scale", "count", "publish"]
 
 

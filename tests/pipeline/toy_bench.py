@@ -135,14 +135,13 @@ class ExportStage(Stage):
 
 
 ORDER = ["views", "init", "fit", "export", "evaluate"]
-STAGES = {
-    s.name: ToyEntryPoint(s) for s in (ViewsStage, InitStage, FitStage, ExportStage, EvaluateStage)
-}
+TOYS = (ViewsStage, InitStage, FitStage, ExportStage, EvaluateStage)
+STAGES = {stage.name: [ToyEntryPoint(stage)] for stage in TOYS}
 
 
 def install() -> None:
     """Replace the registered stages of this process by the toys."""
-    from pipeline.benchmarking import running
+    from pipeline.studies.benchmark import running
 
     KINDS["numbers"] = "toy:Numbers"
     pipeline.stage._entry_points = lambda: STAGES  # type: ignore[assignment]
@@ -155,7 +154,7 @@ if __name__ == "__main__":
     assert toy.Numbers is Numbers
     install()
     if sys.argv[1] == "worker":
-        from pipeline.benchmarking.worker import main as worker
+        from pipeline.studies.benchmark.worker import main as worker
 
         worker()
     else:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipeline.artifacts.fdi import Jaw, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView

@@ -15,7 +15,7 @@ import numpy as np
 
 from data_samples.mouths import Mouth, Photograph, photograph, random_mouth
 from data_samples.mouths.cameras import Camera, look
-from pipeline.artifacts.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
+from pipeline.artifacts.dental.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import angle_between

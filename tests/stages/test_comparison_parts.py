@@ -11,10 +11,17 @@ import pytest
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from pipeline.geometry.model_points import as_points, read_model_points
-from stages.comparison import clouds, evidence, poses
-from stages.comparison.colmap_run import SETTINGS, Job, as_stored, run_job, run_on_views, thresholds
-from stages.comparison.models import read_largest
+from pipeline.geometry.models.model_points import as_points, read_model_points
+from pipeline.studies.compare import clouds, evidence, poses
+from pipeline.studies.compare.colmap_run import (
+    SETTINGS,
+    Job,
+    as_stored,
+    run_job,
+    run_on_views,
+    thresholds,
+)
+from pipeline.studies.compare.models import read_largest
 from stages.views.orientation import make_upright, upright_from_stored
 from tests.stages.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 
@@ -256,7 +263,7 @@ def test_distances_between_clouds():
 
 def test_numbered_photographs_are_not_taken_for_numbered_views(tmp_path, monkeypatch):
     """Views 000, 001, 002 of photographs 001, 002, 000: only the right cameras may match."""
-    from stages.comparison import colmap_run
+    from pipeline.studies.compare import colmap_run
 
     cameras = true_cameras()
     names = ["001.png", "002.png", "000.png"]

@@ -15,9 +15,9 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from pipeline.store import Store
+from pipeline.studies.compare.compare import compare
+from pipeline.studies.compare.tables import markdown, tables_of
 from stages.align.stage import AlignStage
-from stages.comparison.compare import compare
-from stages.comparison.tables import markdown, tables_of
 from stages.init.config import InitConfig
 from stages.init.stage import InitStage
 from stages.swap.stage import SwapConfig, SwapStage

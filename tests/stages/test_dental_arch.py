@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.fdi import JAWS
+from pipeline.artifacts.dental.fdi import JAWS
 from pipeline.artifacts.teeth import Crown, Dentition
 from pipeline.errors import RequestError
 from stages.init.dental.cameras import kernels

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.artifacts.fdi import JAWS, permanent_of
+from pipeline.artifacts.dental.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext

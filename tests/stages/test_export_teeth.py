@@ -12,7 +12,7 @@ import pytest
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage

@@ -11,7 +11,7 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.geometry.known_cameras import (
+from pipeline.geometry.models.known_cameras import (
     KnownCamera,
     as_pinhole,
     matching_cameras,

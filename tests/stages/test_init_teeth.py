@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.corrections import CORRECTIONS
-from pipeline.artifacts.fdi import is_upper
+from pipeline.artifacts.dental.corrections import CORRECTIONS
+from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.crowns import (
     NATURAL_TILT,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.artifacts.fdi import JAWS, is_primary, permanent_of
+from pipeline.artifacts.dental.fdi import JAWS, is_primary, permanent_of
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.stage import LocalContext
 from pipeline.store import Store

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import numpy as np
 import pytest
 
-from pipeline.artifacts.fdi import teeth_of
+from pipeline.artifacts.dental.fdi import teeth_of
 from stages.dentition.tooth_rows import (
     NO_TOOTH,
     POSITIONS,

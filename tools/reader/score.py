@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from pipeline.artifacts.fdi import is_upper, permanent_of
+from pipeline.artifacts.dental.fdi import is_upper, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition, filled
 from stages.teeth.read import read_photograph
 

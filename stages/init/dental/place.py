@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera, Cameras
-from pipeline.artifacts.corrections import (
+from pipeline.artifacts.dental.corrections import (
     CORRECTIONS,
     Corrections,
     CrownCorrection,

@@ -15,11 +15,11 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
-from pipeline.geometry.known_cameras import KnownCamera, as_pinhole
+from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.geometry.world import similarity_between
 from pipeline.stage import StageContext
 from stages.dentition.crowns import dentition_of, outline_of
-from stages.init.config import InitConfig
+from stages.init.config import CAMERAS, InitConfig
 from stages.init.dental.cameras.centred import CentredView, centre_view
 from stages.init.dental.place import (
     arch_options,
@@ -93,7 +93,9 @@ def from_known_teeth(
         RequestError: the settings of `init.dental` don't fit the photographs.
     """
     config: InitConfig = context.config
-    pairs = [as_pinhole(view, known[view.name]) for view in views.views if view.name in known]
+    pairs = [
+        as_pinhole(view, known[view.name], CAMERAS) for view in views.views if view.name in known
+    ]
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
     centred = [centre_view(view, camera) for view, camera in pairs]
     names = [photo_name(view) for view in placed]

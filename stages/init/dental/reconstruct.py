@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError

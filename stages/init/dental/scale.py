@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.artifacts.fdi import teeth_of
+from pipeline.artifacts.dental.fdi import teeth_of
 from pipeline.errors import RequestError
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw, primary_of
+from pipeline.artifacts.dental.fdi import Jaw, primary_of
 from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
 from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]

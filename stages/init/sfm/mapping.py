@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.geometry.colmap import quiet_pycolmap
 from pipeline.geometry.graph import Pair
+from pipeline.geometry.models.colmap import quiet_pycolmap
 from stages.init.sfm.mappers import MapperOptions, global_models, incremental_models
 from stages.init.sfm.matching.two_view import Correspondences, Lens, TwoView
 from stages.init.sfm.undistort import undistort_pixels

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry.colmap import quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
 from stages.init.sfm.mapping import Distortions, MappingInput, Solution, lens_cameras, solution_of
 from stages.init.sfm.options import RefinementOptions
 from stages.init.sfm.solver import EXIF_TOLERANCE, Solver

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
-from pipeline.geometry.known_cameras import resampled
+from pipeline.geometry.models.known_cameras import resampled
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from pipeline.artifacts.fdi import is_upper
+from pipeline.artifacts.dental.fdi import is_upper
 from stages.init.dental.cameras.bundle import Adjusted, Matches
 from stages.init.dental.template import GUM_STEPS, landmark_names
 

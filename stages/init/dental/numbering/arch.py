@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, permanent_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
 from stages.dentition.tooth_rows import NO_TOOTH, Labels

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, is_upper
+from pipeline.artifacts.dental.fdi import JAWS, is_upper
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW

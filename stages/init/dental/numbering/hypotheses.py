@@ -15,7 +15,7 @@ from itertools import pairwise, product
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import is_upper
+from pipeline.artifacts.dental.fdi import is_upper
 from stages.dentition.tooth_rows import NO_TOOTH, Labels, best_rows
 from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
 from stages.init.dental.cameras.held import HeldCameras

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, is_primary, permanent_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, is_primary, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer

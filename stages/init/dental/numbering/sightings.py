@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import JAWS, Jaw
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Point
 from stages.dentition.tooth_rows import NO_TOOTH, ChainOptions, Labels, position_evidence
 from stages.init.dental.cameras.bundle import Sightings

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart import ChartGrid, grid_around, normals_of
 from stages.init.dental.surface.crown_shape import (

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.dental.fdi import Jaw
 from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]

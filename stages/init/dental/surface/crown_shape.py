@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RBFInterpolator
 
-from pipeline.artifacts.fdi import Jaw, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, teeth_of
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.surface.chart import AXIS_DEPTH, ChartGrid, unroll
 from stages.init.dental.template import GUM_STEPS

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.charts import (

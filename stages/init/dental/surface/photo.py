@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.fdi import Jaw
+from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import PlacedView
 from stages.stereo.appearance import highlights

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.colmap import quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
 
 
 @dataclass(frozen=True)

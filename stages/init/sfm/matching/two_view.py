@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.colmap import quiet_pycolmap
 from pipeline.geometry.graph import Pair, spanning_pairs
+from pipeline.geometry.models.colmap import quiet_pycolmap
 from pipeline.geometry.rigid import angle_between
 
 Array = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Teeth by number, and what a person says of those that were found."""

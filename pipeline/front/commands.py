@@ -1,0 +1,110 @@
+"""What the command line and `import pipeline` call: a run with its report, the stages there are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import Config, load_config
+from pipeline.errors import PipelineError, ReconstructionError, StageError
+from pipeline.runner import Reporter, Runner, RunSummary
+from pipeline.stage import get_stage, stage_names
+from pipeline.workspace import make_request
+
+
+def run(
+    images: Sequence[str | Path] | str | Path = (),
+    *,
+    workspace: str | Path | None = None,
+    preset: str | Path | None = None,
+    overrides: Iterable[str] | Mapping[str, Any] = (),
+    stages: Sequence[str] | None = None,
+    from_stage: str | None = None,
+    force: bool = False,
+    dry_run: bool = False,
+    reporter: Reporter | None = None,
+) -> RunSummary:
+    """Run the pipeline on photographs, reusing every result that is still valid.
+
+    Args:
+        images: a folder, files, a glob pattern or one video; empty to take the `views` that the
+            workspace holds as they are.
+        workspace: where results are kept; default ``./runs/<name of the input>``.
+        preset: name or YAML file of a preset.
+        overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.
+        stages: names of the stages to run, in order; default all of the preset.
+        from_stage: begin here, with what the workspace holds from before.
+        force: compute the stages anew although a valid result exists.
+        dry_run: only say what would be done.
+        reporter: hears of the progress.
+
+    Raises:
+        RequestError: the request is wrong. ReconstructionError: the data can't be reconstructed.
+        StageError: a fault of ours.
+    """
+    request = make_request(images, workspace, preset, overrides, stages, from_stage)
+    config = load_config(request.preset, request.overrides)
+    reporter = reporter or Reporter()
+    runner = Runner(request, config, reporter)
+    if dry_run:
+        return runner.dry_run(force=force)
+    try:
+        summary = runner.run(force=force)
+    except (ReconstructionError, StageError) as error:
+        report, check = _write_pages(request.workspace, config, reporter)
+        if report is not None:
+            reporter.message(f"What came of it so far: {report}")
+        if check and isinstance(error, ReconstructionError) and error.artifacts:
+            error.args = (f"{error} To put it right, open {check} in a browser.",)
+        raise
+    summary.report, summary.check = _write_pages(request.workspace, config, reporter)
+    return summary
+
+
+def _write_pages(
+    workspace: Path, config: Config, reporter: Reporter
+) -> tuple[Path | None, Path | None]:
+    """Write the report, and the page to put the teeth right where there are any.
+
+    Whatever goes wrong with it is said, and harms nothing else.
+    """
+    if not config.run.report:
+        return None, None
+    from pipeline.pages.page import CHECK
+    from pipeline.studies.report import run_report
+
+    try:
+        report = run_report(workspace)
+    except Exception as error:
+        reporter.message(f"The report could not be written: {error}")
+        return None, None
+    check = workspace / CHECK
+    return report, check if check.is_file() else None
+
+
+def stages() -> list[dict[str, Any]]:
+    """The registered stages: what each requires and provides, its methods and its settings."""
+    order = list(load_config().run.stages)
+    names = sorted(stage_names(), key=lambda n: (order.index(n) if n in order else len(order), n))
+    found: list[dict[str, Any]] = []
+    for name in names:
+        try:
+            stage = get_stage(name)
+        except PipelineError as error:
+            found.append({"name": name, "error": str(error)})
+            continue
+        found.append(
+            {
+                "name": name,
+                "summary": stage.summary,
+                "version": stage.version,
+                "requires": list(stage.requires),
+                "optional": list(stage.optional),
+                "provides": list(stage.provides),
+                "may_provide": list(stage.may_provide),
+                "methods": dict(stage.methods),
+                "settings": stage.Config.model_json_schema(),
+            }
+        )
+    return found

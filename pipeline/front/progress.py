@@ -1,0 +1,133 @@
+"""What the user sees while stages run: a live display on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, TextIO
+
+from pipeline.runner import Figure, Reporter
+
+
+def describe(figures: dict[str, Any]) -> str:
+    """``loss 0.031, gaussians 20000``."""
+    parts = []
+    for name, value in figures.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else f"{value}"
+        parts.append(f"{name.replace('_', ' ')} {shown}")
+    return ", ".join(parts)
+
+
+class Pace:
+    """Estimates the time left from how fast the step that is going on has gone so far."""
+
+    def __init__(self) -> None:
+        self._step: tuple[str, str] | None = None
+
+    def time_left(self, stage: str, step: str, done: int, total: int, now: float) -> str:
+        """E.g. ``12 s left``; empty while nothing is known.
+
+        Args:
+            now: a clock's seconds.
+        """
+        if self._step != (stage, step):
+            self._step, self._start, self._first = (stage, step), now, done
+        elapsed, gained = now - self._start, done - self._first
+        if gained <= 0 or done >= total or elapsed < 1.0:
+            return ""
+        seconds = elapsed * (total - done) / gained
+        return f"{seconds:.0f} s left" if seconds < 90 else f"{seconds / 60:.0f} min left"
+
+
+class LineReporter(Reporter):
+    """Plain log lines for a file, a pipe or a batch system."""
+
+    def __init__(self, stream: TextIO | None = None, interval: float = 5.0) -> None:
+        self._stream = stream or sys.stderr
+        self._interval = interval
+        self._last = 0.0
+        self._pace = Pace()
+
+    def _say(self, text: str) -> None:
+        print(text, file=self._stream, flush=True)
+
+    def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
+        self._last = time.monotonic()
+        why = f" ({'; '.join(reasons)})" if reasons else ""
+        self._say(f"{stage}: {'goes on from its checkpoint' if resumed else 'starts'}{why}")
+
+    def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
+        now = time.monotonic()
+        left = self._pace.time_left(stage, step, done, total, now)
+        if now - self._last < self._interval:
+            return
+        self._last = now
+        more = [describe(figures), left]
+        self._say(f"{stage}: {step} {done}/{total}" + "".join(f", {m}" for m in more if m))
+
+    def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
+        if cached:
+            self._say(f"{stage}: cached")
+        else:
+            seconds, summary = figures["wall_seconds"], describe(figures["summary"])
+            self._say(f"{stage}: done in {seconds:.1f} s{f' ({summary})' if summary else ''}")
+
+    def message(self, text: str) -> None:
+        self._say(text)
+
+
+class LiveReporter(Reporter):
+    """A rich progress display: one line per finished stage, a bar for the running one."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._console = Console(stderr=True, highlight=False)
+        self._display = Progress(
+            TextColumn("[bold]{task.fields[stage]:>9}[/]"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}"),
+            console=self._console,
+            transient=True,
+        )
+        self._task: Any = None
+        self._pace = Pace()
+
+    def start(self, stages: list[str]) -> None:
+        self._display.start()
+
+    def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
+        text = "goes on from its checkpoint" if resumed else "; ".join(reasons)
+        self._task = self._display.add_task(text, total=None, stage=stage)
+
+    def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
+        left = self._pace.time_left(stage, step, done, total, time.monotonic())
+        more = [describe(figures), left]
+        text = step + "".join(f" · {part}" for part in more if part)
+        self._display.update(self._task, completed=done, total=total, description=text)
+
+    def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
+        if self._task is not None:
+            self._display.remove_task(self._task)
+            self._task = None
+        if cached:
+            self._console.print(f"[bold]{stage:>9}[/] [dim]cached[/]")
+        else:
+            text = f"{figures['wall_seconds']:6.1f} s  [dim]{describe(figures['summary'])}[/]"
+            self._console.print(f"[bold]{stage:>9}[/] {text}")
+
+    def message(self, text: str) -> None:
+        self._console.print(text, style="yellow", markup=False)
+
+    def stop(self) -> None:
+        self._display.stop()
+
+
+def make_reporter(quiet: bool = False) -> Reporter:
+    """The reporter that suits standard error."""
+    if quiet:
+        return Reporter()
+    return LiveReporter() if sys.stderr.isatty() else LineReporter()

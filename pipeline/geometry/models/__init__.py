@@ -1,0 +1,1 @@
+"""Models that others made: COLMAP's files, `transforms.json`, and whose photographs they mean."""

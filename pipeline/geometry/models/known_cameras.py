@@ -1,0 +1,313 @@
+"""Cameras that are known: a COLMAP model, or a `transforms.json` as nerfstudio writes it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.views import View, to_uint8
+from pipeline.errors import RequestError
+from pipeline.geometry.models.colmap import check_whole, quiet_pycolmap
+
+Array = npt.NDArray[np.float64]
+
+COLMAP_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+#: OpenGL cameras (y up, z back), which `transforms.json` holds, to OpenCV cameras.
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+#: What messages call the cameras where no setting is named.
+SETTING = "cameras"
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """A posed image of the user's.
+
+    Attributes:
+        name: file name or path of its image, as the model has it.
+        lens: `pycolmap.Camera`, in the pixels of that image.
+        cam_from_world: [4, 4], OpenCV axes, in the model's world.
+    """
+
+    name: str
+    lens: Any
+    cam_from_world: Array
+
+
+def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
+    """The files of a model: label -> file.
+
+    Args:
+        path: a folder with a COLMAP model (text or binary; also with ``sparse/0`` or ``0`` in it),
+            a folder with a `transforms.json`, or such a file itself.
+        setting: name of the setting that gave the path, for messages.
+
+    Raises:
+        RequestError: there is nothing of the kind.
+    """
+    path = path.expanduser()
+    if path.is_file() and path.suffix.lower() == ".json":
+        return {"cameras/transforms.json": path}
+    for folder in (path, path / "0", path / "sparse", path / "sparse" / "0"):
+        for suffix in (".bin", ".txt"):
+            found = {
+                f"cameras/{stem}{suffix}": folder / f"{stem}{suffix}"
+                for stem in COLMAP_FILES
+                if (folder / f"{stem}{suffix}").is_file()
+            }
+            if f"cameras/cameras{suffix}" in found and f"cameras/images{suffix}" in found:
+                return found
+    if (path / "transforms.json").is_file():
+        return {"cameras/transforms.json": path / "transforms.json"}
+    raise RequestError(
+        f"{setting}: {path} holds no cameras. Give a folder with a COLMAP model (cameras.bin "
+        "and images.bin, or .txt), or a transforms.json as nerfstudio writes it."
+    )
+
+
+def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[KnownCamera], str]:
+    """Read what `model_files` found.
+
+    Args:
+        files: those of one model.
+        setting: name of the setting that gave them, for messages.
+
+    Returns:
+        The posed images sorted by name, and the units (``"mm"`` where the file says so, else
+        ``"arbitrary"``).
+
+    Raises:
+        RequestError: the files are damaged, or hold no posed image.
+    """
+    files = list(files)
+    source = files[0].parent if files[0].suffix != ".json" else files[0]
+    try:
+        if files[0].suffix == ".json":
+            cameras, units = _read_transforms(files[0], setting)
+        else:
+            cameras, units = _read_colmap(files[0].parent), "arbitrary"
+    except RequestError:
+        raise
+    except Exception as error:
+        raise RequestError(
+            f"{setting}: {source} can't be read ({type(error).__name__}: {error}). Is it whole?"
+        ) from error
+    if not cameras:
+        raise RequestError(f"{setting}: {source} holds no posed image.")
+    return sorted(cameras, key=lambda camera: camera.name), units
+
+
+def _read_colmap(folder: Path) -> list[KnownCamera]:
+    check_whole(folder)
+    model = quiet_pycolmap().Reconstruction(str(folder))
+    return [
+        KnownCamera(
+            image.name,
+            model.cameras[image.camera_id],
+            np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
+        )
+        for image in model.images.values()
+        if image.has_pose
+    ]
+
+
+def _read_transforms(path: Path, setting: str) -> tuple[list[KnownCamera], str]:
+    data = json.loads(path.read_text())
+    cameras = []
+    for number, frame in enumerate(data["frames"]):
+        said: Mapping[str, Any] = {**data, **frame}
+        pose = np.array(frame["transform_matrix"], np.float64)
+        if pose.shape not in ((3, 4), (4, 4)):
+            raise RequestError(
+                f"{setting}: frame {number} of {path} has a transform_matrix of shape "
+                f"{'x'.join(map(str, pose.shape))}, not 4x4."
+            )
+        pose = np.vstack([pose[:3], [0, 0, 0, 1]])
+        cam_from_world = np.asarray(np.linalg.inv(pose @ OPENCV_FROM_OPENGL), np.float64)
+        cameras.append(
+            KnownCamera(str(frame["file_path"]), _lens(said, path, setting), cam_from_world)
+        )
+    return cameras, "mm" if data.get("units") == "mm" else "arbitrary"
+
+
+def _lens(said: Mapping[str, Any], path: Path, setting: str) -> Any:
+    try:
+        width, height = int(said["w"]), int(said["h"])
+        if "fl_x" in said:
+            fx = float(said["fl_x"])
+        else:
+            fx = 0.5 * width / np.tan(0.5 * float(said["camera_angle_x"]))
+    except KeyError as error:
+        raise RequestError(
+            f"{setting}: {path} gives no {error} for {said.get('file_path', 'a frame')}. It "
+            "needs w, h and fl_x (or camera_angle_x), for all frames or for each."
+        ) from None
+    fisheye = "FISHEYE" in str(said.get("camera_model", ""))
+    distortion = [float(said.get(name, 0)) for name in
+                  (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2"))]  # fmt: skip
+    parameters = [
+        fx, float(said.get("fl_y", fx)), float(said.get("cx", width / 2)),
+        float(said.get("cy", height / 2)), *distortion,
+    ]  # fmt: skip
+    return quiet_pycolmap().Camera(
+        model="OPENCV_FISHEYE" if fisheye else "OPENCV",
+        width=width, height=height, params=parameters,
+    )  # fmt: skip
+
+
+def matching_cameras(
+    cameras: list[KnownCamera], views: Iterable[View], setting: str = SETTING
+) -> dict[str, KnownCamera]:
+    """Name of a view -> its camera: by the name of the source file, with or without suffix.
+
+    Models that we exported have the names of views. Of all these ways the one that finds most
+    cameras holds, so that photographs 000, 005, 010 are not taken for views of these names.
+
+    Args:
+        cameras: of the model.
+        views: with names of their own.
+        setting: name of the setting that gave the model, for messages.
+
+    Raises:
+        RequestError: fewer than two views have a camera, or one has several.
+    """
+    views = list(views)
+    schemes: tuple[tuple[Callable[[View], str], Callable[[str], str]], ...] = (
+        (lambda view: view.source_name, str),
+        (lambda view: PurePath(view.source_name).name, lambda name: PurePath(name).name),
+        (lambda view: PurePath(view.source_name).stem, lambda name: PurePath(name).stem),
+        (lambda view: view.name, lambda name: PurePath(name).stem),  # a model that we exported
+    )
+    best: dict[str, list[KnownCamera]] = {}
+    for name_of_view, name_of_camera in schemes:
+        fitting = {
+            view.name: [c for c in cameras if name_of_camera(c.name) == name_of_view(view)]
+            for view in views
+            if name_of_view(view)
+        }
+        found = {name: those for name, those in fitting.items() if those}
+        if len(found) > len(best):
+            best = found
+    several = next((those for those in best.values() if len(those) > 1), None)
+    if several is not None:
+        raise RequestError(
+            f"{setting}: {len(several)} cameras fit one photograph "
+            f"({', '.join(camera.name for camera in several[:3])}). Give each image a name of its "
+            "own."
+        )
+    if len(best) >= 2:
+        return {name: those[0] for name, those in best.items()}
+    raise RequestError(
+        f"{setting}: fewer than two of the {len(views)} photographs have a camera in the model. "
+        f"The names there are like {cameras[0].name}, the photographs' like "
+        f"{views[0].source_name or views[0].name}."
+    )
+
+
+def pinhole_camera(view: View, known: KnownCamera, setting: str = SETTING) -> Camera:
+    """The camera of a view without the distortion of its lens, in the model's world.
+
+    The lens may refer to the stored pixel grid of the photograph, to the upright one, or to either
+    at another size.
+
+    Raises:
+        RequestError: the lens's image has another shape than the photograph.
+    """
+    lens = known.lens
+    working_from_lens = working_pixels_from_lens(view, known, setting)
+    linear = working_from_lens[:2, :2]
+    focal = np.abs(linear) @ np.array([lens.focal_length_x, lens.focal_length_y])
+    centre = working_from_lens @ np.array([lens.principal_point_x, lens.principal_point_y, 1.0])
+    pose = np.eye(4)
+    pose[:3] = _turn(working_from_lens) @ known.cam_from_world[:3]
+    return Camera(
+        view.name, view.width, view.height, float(focal[0]), float(focal[1]),
+        float(centre[0]), float(centre[1]), pose,
+    )  # fmt: skip
+
+
+def _turn(working_from_lens: Array) -> Array:
+    """[3, 3] R in A K = K' R: rows of A are axes of the working image, turned by quarters."""
+    linear = working_from_lens[:2, :2]
+    turn = np.eye(3)
+    turn[:2, :2] = np.sign(np.where(np.abs(linear) > 1e-9, linear, 0))
+    return turn
+
+
+def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[View, Camera]:
+    """The view as a pinhole camera sees it, and that camera (`pinhole_camera`).
+
+    Distortion is taken out of the image; what the lens did not see is masked.
+
+    Raises:
+        RequestError: the lens's image has another shape than the photograph.
+    """
+    lens = known.lens
+    camera = pinhole_camera(view, known, setting)
+    working_from_lens = working_pixels_from_lens(view, known, setting)
+    turn = _turn(working_from_lens)
+    distortion = [lens.params[index] for index in lens.extra_params_idxs()]
+    if not np.any(np.abs(distortion) > 1e-9):
+        return view, camera
+    v, u = np.mgrid[: view.height, : view.width] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    pixels = lens.img_from_cam(np.ascontiguousarray((rays @ turn).reshape(-1, 3)))
+    pixels = np.where(np.isfinite(pixels), pixels, -1e6)
+    source = pixels @ working_from_lens[:2, :2].T + working_from_lens[:2, 2] - 0.5
+    straight = resampled(view, source.reshape(view.height, view.width, 2))
+    parameters = " ".join(f"{value:.9g}" for value in lens.params)
+    text = f"{lens.model_name} {lens.width} {lens.height} {parameters}"
+    return replace(straight, lens_taken_out=text), camera
+
+
+def resampled(view: View, source: npt.NDArray[np.floating[Any]]) -> View:
+    """The view whose pixels [H, W] come from the positions `source` [H, W, 2] of the old ones.
+
+    Positions are of array indices (pixel centres at integers). What comes from outside is masked.
+    """
+    position = source.astype(np.float32)
+    image = cv2.remap(
+        view.image, position[..., 0], position[..., 1], cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    inside = (position > -0.5).all(-1)
+    inside &= (position[..., 0] < view.width - 0.5) & (position[..., 1] < view.height - 0.5)
+    if view.mask is not None:
+        inside &= (
+            cv2.remap(
+                view.mask.astype(np.float32), position[..., 0], position[..., 1], cv2.INTER_LINEAR
+            )
+            > 0.5
+        )
+    image = rounded(np.where(inside[..., None], image, 0))
+    return replace(view, image=image, mask=None if inside.all() else inside)
+
+
+def rounded(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
+    """The image at eight bits, as it is at rest: the next stage must see what this one sees."""
+    return to_uint8(image).astype(np.float32) / np.float32(255)
+
+
+def working_pixels_from_lens(view: View, known: KnownCamera, setting: str) -> Array:
+    """[3, 3] affine map from the pixels of the model's image to the view's."""
+    lens = known.lens
+    width, height = view.source_size if min(view.source_size) > 0 else (view.width, view.height)
+    shape = lens.width / lens.height
+    stored, upright = width / height, view.width / view.height
+    if abs(np.log(shape / stored)) < 0.02:
+        scale = np.diag([width / lens.width, height / lens.height, 1.0])
+        return np.asarray(view.working_from_source @ scale)
+    if abs(np.log(shape / upright)) < 0.02:
+        return np.diag([view.width / lens.width, view.height / lens.height, 1.0])
+    raise RequestError(
+        f"{setting}: the camera of {known.name} is for an image of {lens.width} x {lens.height} "
+        f"pixels, but the photograph {view.source_name or view.name} has {width} x {height}. Give "
+        "the photographs that the cameras were made from."
+    )

@@ -1,0 +1,105 @@
+"""The sparse points of a COLMAP model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.points import Points
+from pipeline.geometry.models.colmap import quiet_pycolmap
+
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """Points as the model has them, in its world, sorted by their identifiers there.
+
+    Attributes:
+        positions: [P, 3] float64.
+        colors: [P, 3] float32 sRGB in 0..1; black where the model was made without colours.
+        observed: image name -> [K] sorted indices of the points that it observes.
+    """
+
+    positions: npt.NDArray[np.float64]
+    colors: npt.NDArray[np.float32]
+    observed: dict[str, Integers]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def track_lengths(self) -> Integers:
+        """[P] in how many images each point was found."""
+        count = np.zeros(len(self), np.int64)
+        for indices in self.observed.values():
+            count[indices] += 1
+        return count
+
+
+def read_model_points(folder: Path) -> ModelPoints:
+    """Read the points of a COLMAP model (text or binary, of any version).
+
+    Args:
+        folder: of the model's files.
+    """
+    model = quiet_pycolmap().Reconstruction(str(folder))
+    identifiers = sorted(model.points3D)
+    seen: dict[str, set[int]] = {
+        image.name: set() for image in model.images.values() if image.has_pose
+    }
+    for number, identifier in enumerate(identifiers):
+        for element in model.points3D[identifier].track.elements:
+            seen[model.images[element.image_id].name].add(number)
+    points = [model.points3D[identifier] for identifier in identifiers]
+    colors = np.array([point.color for point in points], np.float32).reshape(-1, 3)
+    return ModelPoints(
+        positions=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        colors=colors / np.float32(255),
+        observed={name: np.array(sorted(seen[name]), np.int64) for name in sorted(seen)},
+    )
+
+
+def as_points(
+    positions: npt.NDArray[np.float64],
+    colors: npt.NDArray[np.float32],
+    observed: Mapping[str, Integers],
+    cameras: Mapping[str, Camera],
+) -> Points:
+    """Sparse points as a cloud to start a fit from.
+
+    The normal points to the cameras that observed the point (their mean direction), the confidence
+    is the number of images that it was found in, and the scale the mean distance to its three
+    nearest neighbours, as in 3D Gaussian Splatting.
+
+    Args:
+        positions: [P, 3] in the world of `cameras`.
+        colors: [P, 3] sRGB in 0..1.
+        observed: name -> [K] indices of points that it observes.
+        cameras: name -> camera; observations by others only count for the confidence.
+    """
+    normals = np.zeros((len(positions), 3))
+    count = np.zeros(len(positions))
+    for name, indices in sorted(observed.items()):
+        count[indices] += 1
+        if name in cameras:
+            towards = cameras[name].centre - positions[indices]
+            length = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            normals[indices] += towards / length
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    neighbours = min(4, len(positions))
+    scale = np.zeros(len(positions))
+    if neighbours > 1:
+        scale = cKDTree(positions).query(positions, k=neighbours)[0][:, 1:].mean(1)
+    return Points(
+        positions=positions.astype(np.float32),
+        colors=np.asarray(colors, np.float32),
+        normals=normals.astype(np.float32),
+        confidence=np.maximum(count, 1).astype(np.float32),
+        scale=scale.astype(np.float32),
+    )

@@ -1,0 +1,1 @@
+"""What pages are made of: parts, tables, charts, pictures, and the run that they tell of."""

@@ -1,0 +1,81 @@
+"""The templates, and how numbers are written."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import RequestError
+from pipeline.files import write_atomic
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+#: Pages in a workspace: what the last run did, and the teeth to put right where there are any.
+REPORT, CHECK = "report.html", "check.html"
+
+
+@cache
+def environment(package: str) -> Environment:
+    """The templates of a package and those that all pages share; what goes in is escaped."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    def source(name: str) -> str | None:
+        for home in (package, "pipeline.pages"):
+            file = files(home) / name
+            if file.is_file():
+                return file.read_text(encoding="utf-8")
+        return None
+
+    made = Environment(
+        loader=FunctionLoader(source), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    made.filters["number"] = number
+    made.filters["seconds"] = seconds
+    return made
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """A figure for people: ``1,234``, ``0.83``; a dash for what is not known."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if not math.isfinite(value):
+        return "–"
+    if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
+        return f"{int(value):,}"
+    return f"{value:,.{digits}f}"
+
+
+def seconds(value: float | None) -> str:
+    """A time for people: ``0.4 s``, ``12 s``, ``3 min 20 s``."""
+    if value is None:
+        return "–"
+    if value < 10:
+        return f"{value:.1f} s"
+    if value < 120:
+        return f"{value:.0f} s"
+    return f"{int(value // 60)} min {value % 60:.0f} s"
+
+
+def write_page(package: str, template: str, out: Path, **content: Any) -> Path:
+    """Fill a template and replace the file in one step.
+
+    Args:
+        package: where the template lies.
+
+    Raises:
+        RequestError: the folder can't be written to.
+    """
+    text = environment(package).get_template(template).render(**content)
+    try:
+        write_atomic(out, text)
+    except OSError as error:
+        raise RequestError(f"The report {out} can't be written ({error.strerror}).") from error
+    return out

@@ -1,0 +1,1 @@
+"""What is done with whole runs: report, compare, benchmark. They may know stages."""

@@ -1,0 +1,19 @@
+"""The report of a run: one self-contained HTML file, and the page to put its teeth right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def run_report(workspace: str | Path) -> Path:
+    """Write ``WORKSPACE/report.html`` from what the workspace holds, and ``check.html`` beside it.
+
+    Returns:
+        The file.
+
+    Raises:
+        RequestError: the folder is not a workspace, or can't be written to.
+    """
+    from pipeline.studies.report.run import write_run_report
+
+    return write_run_report(Path(workspace))

@@ -1,0 +1,163 @@
+"""The page `check.html`: what was taken for which tooth, to put right by a click."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.artifacts.dental.corrections import (
+    CORRECTIONS,
+    Corrections,
+    PhotoCorrection,
+    corrections_file,
+    read_corrections,
+)
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.views import View, Views, to_uint8
+from pipeline.errors import PipelineError
+from pipeline.pages.case import Case
+from pipeline.pages.page import CHECK, write_page
+from pipeline.pages.pictures import picture
+
+Content = dict[str, Any]
+
+#: Numbers are marked from this doubt on.
+DOUBTFUL = 0.1
+#: Long side in pixels of a photograph on the page, and of one without teeth.
+LARGE, SMALL = 1280, 480
+#: Numbers offered for a crown.
+MOST_OFFERED = 5
+#: The setting that names a file of corrections.
+LABELS = "init.dental.labels"
+
+
+def write_check_page(case: Case) -> bool:
+    """Write the page where there are teeth to check, and take away one that no longer holds.
+
+    Returns:
+        Is there a page?
+
+    Raises:
+        RequestError: the folder can't be written to.
+    """
+    from stages.init.report import teeth_of
+
+    out = case.workspace / CHECK
+    teeth, views = teeth_of(case), _views_of(case)
+    if teeth is None or views is None:
+        out.unlink(missing_ok=True)
+        return False
+    path, corrections, problem = _corrections(case)
+    own = path is None or path.parent.resolve() == case.workspace.resolve()
+    write_page(
+        "pipeline.studies.report", "check.html", out, title=case.workspace.resolve().name,
+        data=content(teeth, views, corrections)
+        | {"command": command(case), "target": "" if own else str(path)},
+        failure=(case.failed.failure or "").partition(" Pictures that show it: ")[0]
+        if case.failed else "",
+        problem=problem, doubtful=round(100 * DOUBTFUL), corrections=CORRECTIONS,
+    )  # fmt: skip
+    return True
+
+
+def _views_of(case: Case) -> Views | None:
+    """The photographs as they were read: later stages may mask or undistort them."""
+    names = case.providers("views")
+    found: Views | None = case.load(names[0], "views") if names else None
+    return found
+
+
+def _corrections(case: Case) -> tuple[Path | None, Corrections, str]:
+    """The file of corrections, what it says today, and what is wrong with it."""
+    section: Any = case.settings.get("init")
+    setting = getattr(getattr(section, "dental", None), "labels", None)
+    path = None
+    try:
+        path = corrections_file(setting, {"workspace": case.workspace}, LABELS)
+        return path, read_corrections(path) if path else Corrections(), ""
+    except PipelineError as error:
+        return path, Corrections(), str(error)
+
+
+def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
+    """What the page's script works on, as JSON values."""
+    by_name = teeth.by_name()
+    earlier = corrections.photographs
+    photographs = []
+    for view in views.views:
+        seen = by_name.get(view.name) or Dentition(view.name, (view.width, view.height), "none")
+        names = (view.source_name, view.source_name.rpartition(".")[0], view.name)
+        label = next((name for name in names if name in earlier), view.source_name or view.name)
+        photographs.append(_photograph(view, seen, label, earlier.get(label, PhotoCorrection())))
+    return {"file": CORRECTIONS, "doubtful": DOUBTFUL, "photographs": photographs}
+
+
+def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrection) -> Content:
+    shown = picture(
+        to_uint8(view.image), label, long_side=LARGE if seen.all_crowns else SMALL
+    )  # fmt: skip
+    upright = view.upright_size
+    return {
+        "name": label,
+        "picture": shown.uri,
+        "width": view.width,
+        "height": view.height,
+        "scale": [upright[0] / view.width, upright[1] / view.height],
+        "mirrored": bool(seen.mirrored),
+        "roll": round(float(seen.roll), 4),
+        "kind": seen.kind,
+        "aside": seen.set_aside or ("" if seen.all_crowns else "no teeth were found in it"),
+        "doubts": list(seen.doubts),
+        "crowns": [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3],
+        "earlier": _entries(earlier),
+    }
+
+
+def _crown(crown: Crown) -> Content:
+    offered = sorted(crown.numbers.items(), key=lambda item: (-item[1], item[0]))[:MOST_OFFERED]
+    return {
+        "jaw": crown.jaw,
+        "outline": np.round(crown.outline, 1).tolist(),
+        "number": crown.number,
+        # 0 where a person has said the number, and only there.
+        "doubt": max(round(float(crown.doubt), 3), 0.001) if crown.doubt else 0.0,
+        "weak": bool(crown.doubtful),
+        "offered": [[tooth, round(float(share), 3)] for tooth, share in offered],
+    }
+
+
+def _entries(photo: PhotoCorrection) -> Content:
+    """Corrections as they stand in the file, so that a new file can keep them."""
+    crowns: list[Content] = []
+    for change in photo.crowns:
+        entry: Content = {"at": list(change.at)}
+        if change.tooth is not None:
+            entry["tooth"] = change.tooth
+        elif change.split is not None:
+            entry["split"] = [list(place) for place in change.split]
+        else:
+            entry["remove"] = True
+        crowns.append(entry)
+    said = {"use": photo.use, "kind": photo.kind, "mirrored": photo.mirrored}
+    return said | {"crowns": crowns}
+
+
+def command(case: Case) -> list[str]:
+    """The command that runs the request again, but for the workspace, which the page knows itself.
+
+    Returns:
+        What comes before the workspace's folder and what comes after it, quoted for a shell.
+    """
+    request: Mapping[str, Any] = case.request
+    after = []
+    if request.get("preset"):
+        after += ["-c", request["preset"]]
+    if request.get("stages"):
+        after += ["--stages", ",".join(request["stages"])]
+    for text in request.get("overrides", []):
+        after += ["--set", text]
+    return ["pipeline run -w", shlex.join(after)]
