@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pipeline.benchmarking.paper import ROWS
 from pipeline.config import DEFAULT_PRESET, read_yaml, validate
 from pipeline.errors import RequestError, nearest
+from pipeline.installed import shipped_configs
 
 #: Names become names of folders and files.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)]
@@ -154,9 +154,7 @@ class LoadedSuite:
 
 def suites() -> dict[str, Path]:
     """The suites that come with dentalsplat: name -> file."""
-    beside = Path(__file__).resolve().parents[2] / "configs"
-    folder = beside if beside.is_dir() else Path(str(files("pipeline.presets")))
-    return {path.stem: path for path in sorted(folder.glob("suites/*.yaml"))}
+    return {path.stem: path for path in sorted(shipped_configs().glob("suites/*.yaml"))}
 
 
 def load_suite(suite: str | Path, data: str | Path | None = None) -> LoadedSuite:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from pipeline.errors import ReconstructionError
+from pipeline.installed import library_version
 from pipeline.stage import Stage, StageConfig, StageContext
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ def _describe(
         similarity=scene.frame_from_world.tolist(),
         counts=counts,
         skipped=skipped,
-        versions={name: version(name) for name in ("dentalsplat", *libraries)},
+        versions={name: library_version(name) for name in ("dentalsplat", *libraries)},
     )
     write_json(folder / "scene.json", description)
     (folder / "README.txt").write_text(readme(description))

@@ -1,0 +1,55 @@
+"""What the machine has and what a process took of it, on any system: some lack some calls."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from pathlib import Path
+
+
+def usable_cores() -> int:
+    """How many cores this process may use; where the system can't say, how many there are."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+def cpu_seconds() -> float:
+    """Seconds of processor time of this process and, where the system counts them, its children."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        times = os.times()
+        return time.process_time() + times.children_user + times.children_system
+    own = resource.getrusage(resource.RUSAGE_SELF)
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
+
+
+def reset_peak() -> bool:
+    """Linux can forget the process's peak, so that each stage gets its own; whether it did."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def peak_mb(resettable: bool) -> float:
+    """The most memory this process has held, in MiB; 0 where the system can't say.
+
+    Args:
+        resettable: what `reset_peak` said: the peak since then, else since the process began.
+    """
+    if resettable:
+        with contextlib.suppress(OSError):
+            for line in Path("/proc/self/status").read_text().splitlines():
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 1024  # bytes there, KiB elsewhere
