@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
     from pipeline.progress import Reporter
     from pipeline.runner import RunSummary
-    from pipeline.settings import Setting
+    from pipeline.setting_list import Setting
     from pipeline.workspace import StageStatus
 
 __version__ = "0.1.0"

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipeline.errors import RequestError, nearest
 from pipeline.installed import shipped_configs
 from pipeline.machine import usable_cores
-from pipeline.settings import did_you_mean, model_in, model_settings
+from pipeline.setting_list import did_you_mean, model_in, model_settings
 from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
 
 DEFAULT_PRESET = "dentalsplat"

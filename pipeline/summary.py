@@ -13,7 +13,7 @@ from rich.table import Table
 from pipeline.checkup import Finding
 from pipeline.progress import describe
 from pipeline.runner import RunSummary
-from pipeline.settings import Setting
+from pipeline.setting_list import Setting
 from pipeline.workspace import StageStatus
 
 STATE_STYLE = {"cached": "green", "stale": "yellow", "failed": "red", "problem": "red"}

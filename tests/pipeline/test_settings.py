@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from pipeline.config import load_config
 from pipeline.errors import RequestError
-from pipeline.settings import did_you_mean, in_words, settings
+from pipeline.setting_list import did_you_mean, in_words, settings
 from pipeline.stage import usable_stages
 
 
