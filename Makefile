@@ -26,7 +26,7 @@ wheel-test: .venv/installed-dev
 
 # The site, into runs/site: open runs/site/index.html. Links that lead nowhere are errors.
 docs: .venv/installed-dev
-	$(BIN)/mkdocs build --strict --quiet --site-dir runs/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir runs/site
 
 bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
