@@ -15,7 +15,8 @@ from typing import Any
 ROOT = str(Path(__file__).resolve().parents[1])
 sys.path.insert(0, ROOT)
 
-from pipeline import setting_list, workspace  # noqa: E402
+import pipeline  # noqa: E402
+from pipeline import setting_list  # noqa: E402
 from pipeline.artifacts import KINDS, artifact_class  # noqa: E402
 
 
@@ -37,7 +38,7 @@ def stages_page() -> str:
         "A stage takes artifacts and makes artifacts. This page is made from the code;",
         "`pipeline stages` prints the same.", "",
     ]  # fmt: skip
-    for stage in workspace.stages():
+    for stage in pipeline.stages():
         if "error" in stage:
             raise RuntimeError(stage["error"])
         name = stage["name"]
@@ -88,7 +89,7 @@ def artifacts_page() -> str:
         "",
     ]  # fmt: skip
     made = {kind: [] for kind in KINDS}
-    for stage in workspace.stages():
+    for stage in pipeline.stages():
         for kind in (*stage.get("provides", ()), *stage.get("may_provide", ())):
             made.setdefault(kind, []).append(stage["name"])
     for kind, stages in made.items():
