@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pipeline.checkup import Finding
     from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
+    from pipeline.front.settings import Setting
     from pipeline.progress import Reporter
     from pipeline.runner import RunSummary
-    from pipeline.setting_list import Setting
     from pipeline.workspace import StageStatus
 
 __version__ = "0.1.0"

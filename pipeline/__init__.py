@@ -18,7 +18,7 @@ _HOMES = {
     "stages": "pipeline.workspace",
     "clean": "pipeline.workspace",
     "doctor": "pipeline.checkup",
-    "settings": "pipeline.setting_list",
+    "settings": "pipeline.front.settings",
     "benchmark": "pipeline.benchmarking.running",
     "run_report": "pipeline.report",
     "compare": "stages.comparison.compare",

@@ -15,7 +15,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 
 from pipeline.installed import is_installed, library_version
-from pipeline.machine import usable_cores
+from pipeline.measure import usable_cores
 
 #: distribution -> module to import, for all that a run without a GPU needs.
 LIBRARIES = {

@@ -184,7 +184,7 @@ def settings_command(
     as_json: AsJson = False,
 ) -> None:
     """List every setting: what it may be, its default and its meaning."""
-    from pipeline.setting_list import settings
+    from pipeline.front.settings import settings
     from pipeline.summary import print_settings
 
     found = settings(stage)

@@ -6,18 +6,17 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import RequestError, did_you_mean, nearest
 from pipeline.installed import shipped_configs
-from pipeline.machine import usable_cores
-from pipeline.setting_list import did_you_mean, model_in, model_settings
+from pipeline.measure import usable_cores
 from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
 
 DEFAULT_PRESET = "dentalsplat"
@@ -228,9 +227,9 @@ def _unknown_section(
     if not near:  # the stage left out, as in --set iterations=500
         dotted = f"{name}.{next(iter(value))}" if isinstance(value, dict) and value else name
         names = [
-            found.name
+            entry
             for stage, usable in usable_stages().items()
-            for found in model_settings(usable.Config, stage)
+            for entry in _setting_names(usable.Config, stage)
         ]
         near = did_you_mean(dotted, names)
     return RequestError(
@@ -249,7 +248,7 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
                 f"'{dotted}' is not a setting.{nearest(location[-1], fields)} The settings are "
                 f"{', '.join(fields)}."
             )
-        names = [found.name for found in model_settings(model, section)]
+        names = list(_setting_names(model, section))
         return (
             f"'{dotted}' is not a setting.{did_you_mean(dotted, names)} 'pipeline settings "
             f"{section}' lists all {len(names)} with their meaning."
@@ -284,3 +283,20 @@ def _description(model: type[BaseModel], location: list[str]) -> str | None:
         about = inner.model_fields[part].description
         inner = model_in(inner.model_fields[part].annotation)
     return about
+
+
+def _setting_names(model: type[BaseModel], prefix: str) -> Iterator[str]:
+    """Dotted names of a model's settings and of those of the models in it."""
+    for name, field in model.model_fields.items():
+        inner = model_in(field.annotation)
+        if inner is None or inner is not field.annotation:
+            yield f"{prefix}.{name}"
+        if inner is not None:
+            yield from _setting_names(inner, f"{prefix}.{name}")
+
+
+def model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model that a field holds, directly, optionally or as a list of it."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(model_in, get_args(annotation))), None)

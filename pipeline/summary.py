@@ -11,9 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.checkup import Finding
+from pipeline.front.settings import Setting
 from pipeline.progress import describe
 from pipeline.runner import RunSummary
-from pipeline.setting_list import Setting
 from pipeline.workspace import StageStatus
 
 STATE_STYLE = {"cached": "green", "stale": "yellow", "failed": "red", "problem": "red"}

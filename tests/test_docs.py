@@ -12,7 +12,7 @@ import typer
 
 from pipeline.cli import app
 from pipeline.config import load_config, presets
-from pipeline.setting_list import settings
+from pipeline.front.settings import settings
 from pipeline.stage import stage_names
 
 ROOT = Path(__file__).parents[1]

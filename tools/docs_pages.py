@@ -16,8 +16,8 @@ ROOT = str(Path(__file__).resolve().parents[1])
 sys.path.insert(0, ROOT)
 
 import pipeline  # noqa: E402
-from pipeline import setting_list  # noqa: E402
 from pipeline.artifacts import KINDS, artifact_class  # noqa: E402
+from pipeline.front import settings  # noqa: E402
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -68,9 +68,9 @@ def settings_page() -> str:
         "the same, and `--json` makes it readable for programs. `auto` follows the case; the",
         "summary of a run tells what it came to.", "",
     ]  # fmt: skip
-    for name, model in setting_list.config_models().items():
+    for name, model in settings.config_models().items():
         lines += [f"## {name}", "", "| setting | may be | default | meaning |", "|---|---|---|---|"]
-        for setting in setting_list.model_settings(model, name):
+        for setting in settings.model_settings(model, name):
             default = "" if setting.required else f"`{_short(setting.default)}`"
             lines.append(
                 f"| `{setting.name}` | {_cell(setting.allowed)} | {_cell(default)} | "

@@ -59,7 +59,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.installed import library_version
-from pipeline.machine import usable_cores
+from pipeline.measure import usable_cores
 
 FORMAT = 1
 

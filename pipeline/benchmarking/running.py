@@ -28,7 +28,7 @@ from pipeline.config import parse_override
 from pipeline.errors import RequestError
 from pipeline.files import read_json, write_json
 from pipeline.installed import module_command
-from pipeline.machine import usable_cores
+from pipeline.measure import usable_cores
 from pipeline.report import benchmark_report
 from pipeline.stage import get_stage
 from pipeline.store import Store

@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.files import read_json, write_atomic, write_json
-from pipeline.machine import usable_cores
+from pipeline.measure import usable_cores
 from pipeline.progress import Reporter
 from pipeline.report import REPORT, run_report
 from pipeline.report.compared import FILE, FOLDER

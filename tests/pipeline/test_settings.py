@@ -10,8 +10,8 @@ import pytest
 from pydantic import BaseModel, Field
 
 from pipeline.config import load_config
-from pipeline.errors import RequestError
-from pipeline.setting_list import did_you_mean, in_words, settings
+from pipeline.errors import RequestError, did_you_mean
+from pipeline.front.settings import in_words, settings
 from pipeline.stage import usable_stages
 
 

@@ -8,21 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import machine
+from pipeline import measure
 from pipeline.config import load_config
-from pipeline.measure import Measurement
 
 
 def test_linux_counts_the_cores_that_may_be_used() -> None:
-    assert 1 <= machine.usable_cores() <= (os.cpu_count() or 1)
+    assert 1 <= measure.usable_cores() <= (os.cpu_count() or 1)
 
 
 def test_without_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert machine.usable_cores() == os.cpu_count()
+    assert measure.usable_cores() == os.cpu_count()
     assert load_config().threads == os.cpu_count()
     monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert machine.usable_cores() == 1
+    assert measure.usable_cores() == 1
 
 
 def test_without_resource_and_proc_it_still_measures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,7 +32,7 @@ def test_without_resource_and_proc_it_still_measures(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(Path, "write_text", missing)
     monkeypatch.setattr(Path, "read_text", missing)
-    with Measurement() as work:
+    with measure.Measurement() as work:
         sum(range(200_000))
     assert work.figures["wall_seconds"] > 0
     assert work.figures["cpu_seconds"] >= 0
@@ -41,16 +40,16 @@ def test_without_resource_and_proc_it_still_measures(monkeypatch: pytest.MonkeyP
 
 
 def test_with_resource_alone_memory_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    kib = machine.peak_mb(False)
+    kib = measure.peak_mb(False)
     assert 10 < kib < 100_000
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert machine.peak_mb(False) == pytest.approx(kib / 1024, rel=0.1)
+    assert measure.peak_mb(False) == pytest.approx(kib / 1024, rel=0.1)
 
 
 def test_no_other_module_asks_the_system_itself() -> None:
-    root = Path(machine.__file__).parents[1]
+    root = Path(measure.__file__).parents[1]
     for package in ("dentalsplat", "pipeline", "stages"):
         for path in (root / package).rglob("*.py"):
-            if path != Path(machine.__file__):
+            if path != Path(measure.__file__):
                 text = path.read_text(encoding="utf-8")
                 assert "sched_getaffinity" not in text and "import resource" not in text, path

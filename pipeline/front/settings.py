@@ -5,9 +5,8 @@ All of it is read from the config models, so that it can't be out of date.
 
 from __future__ import annotations
 
-import difflib
 import types
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -15,7 +14,9 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
+from pipeline.config import RunConfig, load_config, model_in
 from pipeline.errors import RequestError, nearest
+from pipeline.stage import usable_stages
 
 _SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 _LENGTHS = {"min_length": "at least {} of them", "max_length": "at most {} of them"}
@@ -65,9 +66,6 @@ def settings(stage: str | None = None) -> list[Setting]:
 
 def config_models() -> dict[str, type[BaseModel]]:
     """``run`` and the stages in their order -> the model of their settings."""
-    from pipeline.config import RunConfig, load_config
-    from pipeline.stage import usable_stages
-
     usable = usable_stages()
     order = [name for name in load_config().run.stages if name in usable]
     order += [name for name in usable if name not in order]
@@ -130,25 +128,3 @@ def _type_in_words(annotation: Any) -> str:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "a section"
     return _WORDS.get(annotation, getattr(annotation, "__name__", str(annotation)))
-
-
-def model_in(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field holds, directly, optionally or as a list of it."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(filter(None, map(model_in, get_args(annotation))), None)
-
-
-def did_you_mean(wrong: str, names: Iterable[str], count: int = 5) -> str:
-    """``" Did you mean fit.iterations, ... or fit.x?"``: the settings nearest to a wrong one."""
-    last = wrong.rpartition(".")[2]
-
-    def likeness(name: str) -> float:
-        whole = difflib.SequenceMatcher(None, wrong, name).ratio()
-        return 2 * difflib.SequenceMatcher(None, last, name.rpartition(".")[2]).ratio() + whole
-
-    close = sorted(names, key=lambda name: (-likeness(name), name))[:count]
-    if not close:
-        return ""
-    *some, one = close
-    return f" Did you mean {', '.join(some)}{' or ' if some else ''}{one}?"
