@@ -7,7 +7,7 @@ STEPS ?= 9000
 RATE ?= 0.003
 BIN := .venv/bin
 
-.PHONY: demo test lint bench reader system chromium clean
+.PHONY: demo test lint wheel-test docs bench reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -19,6 +19,14 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# The wheel, installed into an environment of its own, makes a scene from another folder.
+wheel-test: .venv/installed-dev
+	$(BIN)/python tools/wheel_test.py
+
+# The site, into runs/site: open runs/site/index.html. Links that lead nowhere are errors.
+docs: .venv/installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir runs/site
 
 bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

@@ -3,8 +3,8 @@
     import pipeline
     summary = pipeline.run("photos/", overrides={"fit.iterations": 500})
 
-`run`, `status`, `stages`, `clean` and `doctor` are what the command line calls too. They are
-imported on first use, so that ``import pipeline`` is quick.
+`run`, `status`, `stages`, `settings`, `clean` and `doctor` are what the command line calls too.
+They are imported on first use, so that ``import pipeline`` is quick.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ _HOMES = {
     "stages": "pipeline.front.commands",
     "clean": "pipeline.workspace",
     "doctor": "pipeline.front.checkup",
+    "settings": "pipeline.front.settings",
     "benchmark": "pipeline.studies.benchmark.running",
     "run_report": "pipeline.studies.report",
     "compare": "pipeline.studies.compare.compare",

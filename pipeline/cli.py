@@ -26,7 +26,8 @@ dentalsplat turns a few photographs of teeth into a 3D scene that you can turn a
 
   pipeline status -w cases/anna             what is cached, what is stale and why
   pipeline report -w cases/anna             one page about all of it (a run writes it as well)
-  pipeline stages                           the stages, their methods and settings
+  pipeline stages                           the stages and their methods
+  pipeline settings fit                     what can be set in a stage, and what it means
   pipeline compare -w cases/anna --run-colmap       beside COLMAP on the same photographs
   pipeline benchmark smoke                  methods side by side, in the paper's tables
   pipeline doctor                           is everything installed?
@@ -175,6 +176,24 @@ def stages_command(as_json: AsJson = False) -> None:
         print_stages(found)
 
 
+@app.command("settings")
+def settings_command(
+    stage: Annotated[
+        str | None, typer.Argument(metavar="[STAGE]", help="Only those of this stage.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List every setting: what it may be, its default and its meaning."""
+    from pipeline.front.settings import settings
+    from pipeline.front.summary import print_settings
+
+    found = settings(stage)
+    if as_json:
+        print(json.dumps([dataclasses.asdict(entry) for entry in found], indent=1))
+    else:
+        print_settings(found)
+
+
 @app.command("doctor")
 def doctor_command(as_json: AsJson = False) -> None:
     """Check the installation and say how to mend what is wrong."""
@@ -312,7 +331,7 @@ def _only_workspace() -> Path:
 
 
 def main() -> NoReturn:
-    """Run the command line; every outcome has its exit status (DESIGN, section 5)."""
+    """Run the command line; every outcome has its exit status (docs/architecture.md)."""
     signal.signal(signal.SIGTERM, _interrupt)
     debug = "--debug" in sys.argv
     try:

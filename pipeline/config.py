@@ -5,18 +5,18 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import RequestError, did_you_mean, nearest
+from pipeline.installed import shipped_configs
+from pipeline.measure import usable_cores
 from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
 
 DEFAULT_PRESET = "dentalsplat"
@@ -25,20 +25,21 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class RunConfig(BaseModel):
-    """What is not the business of one stage alone.
-
-    Attributes:
-        stages: the stages of a whole run, in order.
-        seed: all randomness comes from it.
-        threads: 0 means all cores that the process may use. Never changes the result.
-        report: write ``report.html`` into the workspace when a run ends.
-    """
+    """What is not the business of one stage alone."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    stages: tuple[str, ...] = Field(min_length=1)
-    seed: int = Field(0, ge=0, lt=2**32)
-    threads: int = Field(0, ge=0, le=1024)
-    report: bool = True
+    stages: tuple[str, ...] = Field(
+        min_length=1, description="the stages of a whole run, in order (the preset says them)"
+    )
+    seed: int = Field(0, ge=0, lt=2**32, description="all randomness comes from it")
+    threads: int = Field(
+        0, ge=0, le=1024, json_schema_extra={"affects_result": False},
+        description="cores to use; 0: all that the process may use",
+    )  # fmt: skip
+    report: bool = Field(
+        True, json_schema_extra={"affects_result": False},
+        description="write report.html into the workspace when a run ends",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Config:
 
     @property
     def threads(self) -> int:
-        return self.run.threads or len(os.sched_getaffinity(0))
+        return self.run.threads or usable_cores()
 
 
 def load_config(
@@ -76,11 +77,7 @@ def load_config(
     sections = set(stage_names())
     for name in tree:
         if name not in run_fields | sections:
-            known = sorted(run_fields | sections)
-            raise RequestError(
-                f"'{name}' is neither a stage nor a setting of a run; known are "
-                f"{', '.join(known)}.{nearest(name, known)}"
-            )
+            raise _unknown_section(name, tree[name], run_fields, sections)
     run = validate(RunConfig, {k: v for k, v in tree.items() if k in run_fields}, "")
     for name in run.stages:
         if name not in sections:
@@ -107,15 +104,9 @@ def result_fields(config: BaseModel) -> dict[str, Any]:
     return kept
 
 
-def preset_folder() -> Path:
-    """Where the presets lie: beside the packages in the project, in a package where installed."""
-    beside = Path(__file__).resolve().parents[1] / "configs"
-    return beside if beside.is_dir() else Path(str(files("pipeline.presets")))
-
-
 def presets() -> dict[str, Path]:
     """The presets that come with dentalsplat: name -> file."""
-    return {path.stem: path for path in sorted(preset_folder().glob("*.yaml"))}
+    return {path.stem: path for path in sorted(shipped_configs().glob("*.yaml"))}
 
 
 def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
@@ -227,22 +218,57 @@ def validate(model: type[Model], values: Any, section: str) -> Model:
         raise RequestError(" ".join(_explain(model, section, e) for e in error.errors())) from None
 
 
+def _unknown_section(
+    name: str, value: Any, run_fields: set[str], sections: set[str]
+) -> RequestError:
+    """The error of a setting whose first part is no stage."""
+    known = sorted(run_fields | sections)
+    near = nearest(name, known)
+    if not near:  # the stage left out, as in --set iterations=500
+        dotted = f"{name}.{next(iter(value))}" if isinstance(value, dict) and value else name
+        names = [
+            entry
+            for stage, usable in usable_stages().items()
+            for entry in _setting_names(usable.Config, stage)
+        ]
+        near = did_you_mean(dotted, names)
+    return RequestError(
+        f"'{name}' is neither a stage nor a setting of a run; known are {', '.join(known)}.{near}"
+    )
+
+
 def _explain(model: type[BaseModel], section: str, error: Any) -> str:
     """Say in one sentence which field is wrong, what is allowed, and what it is for."""
     location = [str(part) for part in error["loc"] if not str(part).startswith("function-")]
     dotted = ".".join(filter(None, [section, *location]))
     if error["type"] == "extra_forbidden":
-        fields = _fields_at(model, location[:-1])
-        prefix = ".".join(filter(None, [section, *location[:-1]]))
+        if section not in stage_names():  # a suite, say: few enough to name them all
+            fields = _fields_at(model, location[:-1])
+            return (
+                f"'{dotted}' is not a setting.{nearest(location[-1], fields)} The settings are "
+                f"{', '.join(fields)}."
+            )
+        names = list(_setting_names(model, section))
         return (
-            f"'{dotted}' is not a setting.{nearest(location[-1], fields)} The settings"
-            f"{' of ' + prefix if prefix else ''} are {', '.join(fields)}."
+            f"'{dotted}' is not a setting.{did_you_mean(dotted, names)} 'pipeline settings "
+            f"{section}' lists all {len(names)} with their meaning."
         )
     about = _description(model, location)
     return (
         f"{dotted}={error.get('input')!r} is not allowed: {error['msg']}."
         f"{f' It means: {about}' if about else ''}"
     )
+
+
+def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    inner: type[BaseModel] | None = model
+    for part in location:
+        if part.isdigit():  # an entry of a list
+            continue
+        if inner is None or part not in inner.model_fields:
+            return []
+        inner = model_in(inner.model_fields[part].annotation)
+    return list(inner.model_fields) if inner else []
 
 
 def _description(model: type[BaseModel], location: list[str]) -> str | None:
@@ -255,23 +281,22 @@ def _description(model: type[BaseModel], location: list[str]) -> str | None:
         if inner is None or part not in inner.model_fields:
             break
         about = inner.model_fields[part].description
-        inner = _model_in(inner.model_fields[part].annotation)
+        inner = model_in(inner.model_fields[part].annotation)
     return about
 
 
-def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
-    inner: type[BaseModel] | None = model
-    for part in location:
-        if part.isdigit():
-            continue
-        if inner is None or part not in inner.model_fields:
-            return []
-        inner = _model_in(inner.model_fields[part].annotation)
-    return list(inner.model_fields) if inner else []
+def _setting_names(model: type[BaseModel], prefix: str) -> Iterator[str]:
+    """Dotted names of a model's settings and of those of the models in it."""
+    for name, field in model.model_fields.items():
+        inner = model_in(field.annotation)
+        if inner is None or inner is not field.annotation:
+            yield f"{prefix}.{name}"
+        if inner is not None:
+            yield from _setting_names(inner, f"{prefix}.{name}")
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def model_in(annotation: Any) -> type[BaseModel] | None:
     """The model that a field holds, directly, optionally or as a list of it."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next(filter(None, map(_model_in, get_args(annotation))), None)
+    return next(filter(None, map(model_in, get_args(annotation))), None)

@@ -55,3 +55,18 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing."""
     close = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""
+
+
+def did_you_mean(wrong: str, names: Iterable[str], count: int = 5) -> str:
+    """``" Did you mean fit.iterations, ... or fit.x?"``: the settings nearest to a wrong one."""
+    last = wrong.rpartition(".")[2]
+
+    def likeness(name: str) -> float:
+        whole = difflib.SequenceMatcher(None, wrong, name).ratio()
+        return 2 * difflib.SequenceMatcher(None, last, name.rpartition(".")[2]).ratio() + whole
+
+    close = sorted(names, key=lambda name: (-likeness(name), name))[:count]
+    if not close:
+        return ""
+    *some, one = close
+    return f" Did you mean {', '.join(some)}{' or ' if some else ''}{one}?"

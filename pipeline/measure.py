@@ -1,38 +1,38 @@
-"""Wall time, CPU time and peak memory of a piece of work."""
+"""The cores there are, and wall time, CPU time and peak memory of a piece of work.
+
+On any system: some lack calls that Linux has.
+"""
 
 from __future__ import annotations
 
-import resource
+import contextlib
+import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 
-class Measurement:
-    """Use as a context manager; afterwards `figures` holds what was measured."""
-
-    def __enter__(self) -> Measurement:
-        self._resettable = _reset_peak()
-        self._wall = time.perf_counter()
-        self._cpu = _cpu_seconds()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.figures: dict[str, Any] = {
-            "wall_seconds": round(time.perf_counter() - self._wall, 3),
-            "cpu_seconds": round(_cpu_seconds() - self._cpu, 3),
-            "peak_memory_mb": round(_peak_mb(self._resettable), 1),
-        }
+def usable_cores() -> int:
+    """How many cores this process may use; where the system can't say, how many there are."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
+    """Seconds of processor time of this process and, where the system counts them, its children."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        times = os.times()
+        return time.process_time() + times.children_user + times.children_system
     own = resource.getrusage(resource.RUSAGE_SELF)
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
 
 
-def _reset_peak() -> bool:
-    """Linux can forget the process's peak, so that each stage gets its own."""
+def reset_peak() -> bool:
+    """Linux can forget the process's peak, so that each stage gets its own; whether it did."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -40,9 +40,37 @@ def _reset_peak() -> bool:
     return True
 
 
-def _peak_mb(resettable: bool) -> float:
+def peak_mb(resettable: bool) -> float:
+    """The most memory this process has held, in MiB; 0 where the system can't say.
+
+    Args:
+        resettable: what `reset_peak` said: the peak since then, else since the process began.
+    """
     if resettable:
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        with contextlib.suppress(OSError):
+            for line in Path("/proc/self/status").read_text().splitlines():
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 1024  # bytes there, KiB elsewhere
+
+
+class Measurement:
+    """Use as a context manager; afterwards `figures` holds what was measured."""
+
+    def __enter__(self) -> Measurement:
+        self._resettable = reset_peak()
+        self._wall = time.perf_counter()
+        self._cpu = cpu_seconds()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.figures: dict[str, Any] = {
+            "wall_seconds": round(time.perf_counter() - self._wall, 3),
+            "cpu_seconds": round(cpu_seconds() - self._cpu, 3),
+            "peak_memory_mb": round(peak_mb(self._resettable), 1),
+        }

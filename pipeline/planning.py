@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pipeline import installed
 from pipeline.config import Config, result_fields
 from pipeline.errors import RequestError, nearest
 from pipeline.files import canonical_json, sha256_file, sha256_text
@@ -168,7 +168,10 @@ def key_material(
     inputs: Mapping[str, Input],
     sources: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Everything that can change the stage's result; the key is the hash of it (DESIGN, 4)."""
+    """Everything that can change the stage's result; the key is the hash of it.
+
+    docs/architecture.md says why, under "The store".
+    """
     return {
         "stage": stage.name,
         "version": stage.version,
@@ -187,10 +190,7 @@ def key_of(material: dict[str, Any]) -> str:
 @cache
 def library_version(name: str) -> str:
     """Version of an installed distribution, ``"missing"`` where there is none."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "missing"
+    return installed.library_version(name)
 
 
 def stage_inputs(stage: Stage, table: Mapping[str, Input]) -> dict[str, Input]:

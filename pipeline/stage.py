@@ -249,7 +249,7 @@ def get_stage(name: str) -> Stage:
     if not found:
         raise RequestError(
             "No stages are registered: dentalsplat is not installed in this Python environment. "
-            "Install it with 'pip install -c constraints.txt -e .' in its folder."
+            "Install it with 'pip install .' in its folder."
         )
     if name not in found:
         known = ", ".join(sorted(found))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes.util
 import importlib.util
-import os
 import shutil
 import subprocess
 import sys
@@ -14,6 +13,8 @@ from importlib.metadata import distributions
 from pathlib import Path
 
 from pipeline.errors import PipelineError
+from pipeline.installed import is_installed, library_version
+from pipeline.measure import usable_cores
 from pipeline.stage import Finding, get_stage, stage_names
 
 #: distribution -> module to import, for all that a run without a GPU needs.
@@ -25,13 +26,17 @@ LIBRARIES = {
     "pycolmap": "pycolmap",
     "open3d": "open3d",
     "pymeshlab": "pymeshlab",
-    "torch": "torch",
-    "kornia": "kornia",
     "av": "av",
     "pillow": "PIL",
     "pillow-heif": "pillow_heif",
     "plyfile": "plyfile",
     "safetensors": "safetensors",
+}
+
+#: distribution -> module and what is missing without it: the extras.
+OPTIONAL = {
+    "torch": ("torch", "LPIPS, pointmap models and the GPU"),
+    "torchmetrics": ("torchmetrics", "LPIPS"),
 }
 
 #: soname -> Debian package that brings it.
@@ -87,22 +92,23 @@ def _system_libraries() -> Iterator[Finding]:
 
 def _libraries() -> Iterator[Finding]:
     """Import each in a process of its own: a broken native library may crash instead of raising."""
-    script = (
-        "import importlib, importlib.metadata as m, sys\n"
-        "importlib.import_module(sys.argv[1]); print(m.version(sys.argv[2]))"
-    )
+    script = "import importlib, sys\nimportlib.import_module(sys.argv[1])"
     for name, module in LIBRARIES.items():
         done = subprocess.run(
-            [sys.executable, "-c", script, module, name],
+            [sys.executable, "-P", "-c", script, module],
             capture_output=True,
             text=True,
             timeout=120,
         )
         if done.returncode == 0:
-            yield Finding(name, "ok", done.stdout.strip().splitlines()[-1])
+            yield Finding(name, "ok", library_version(name))
         else:
             last = (done.stderr.strip().splitlines() or ["crashed"])[-1]
-            yield Finding(name, "problem", last, f"pip install -c constraints.txt {name}")
+            yield Finding(name, "problem", last, f"pip install {name}")
+    for name, (module, purpose) in OPTIONAL.items():
+        there = is_installed(module)
+        detail = library_version(name) if there else f"not installed; only for {purpose}"
+        yield Finding(name, "ok", detail)
 
 
 def _cv2_wheels() -> Iterator[Finding]:
@@ -121,7 +127,7 @@ def _cv2_wheels() -> Iterator[Finding]:
 
 
 def _processor() -> Iterator[Finding]:
-    threads = len(os.sched_getaffinity(0))
+    threads = usable_cores()
     yield Finding("threads", "ok" if threads > 1 else "note", f"{threads} usable")
     try:
         text = Path("/proc/cpuinfo").read_text()
@@ -149,7 +155,7 @@ def _gpu() -> Iterator[Finding]:
 def _stages() -> Iterator[Finding]:
     names = stage_names()
     if not names:
-        yield Finding("stages", "problem", "none registered", "pip install -c constraints.txt -e .")
+        yield Finding("stages", "problem", "none registered", "Install dentalsplat with pip.")
     for name in names:
         try:
             stage = get_stage(name)

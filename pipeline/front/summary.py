@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.front.progress import describe
+from pipeline.front.settings import Setting
 from pipeline.runner import RunSummary
 from pipeline.stage import Finding
 from pipeline.workspace import StageStatus
@@ -122,6 +125,16 @@ def print_stages(stages: list[dict[str, Any]]) -> None:
         table.add_row(stage["name"], stage["summary"], *kinds)
         for method, text in stage["methods"].items():
             table.add_row("", f"  method {method}: {text}")
+    _console().print(table)
+
+
+def print_settings(settings: list[Setting]) -> None:
+    """Name, type and range, default and meaning of each setting."""
+    table = _table("setting", "may be", "default", "meaning")
+    for setting in settings:
+        default = "-" if setting.required else json.dumps(setting.default, ensure_ascii=False)
+        cells = (setting.name, setting.allowed, default, setting.meaning)
+        table.add_row(*map(escape, cells))
     _console().print(table)
 
 

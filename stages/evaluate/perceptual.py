@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import RequestError
+from pipeline.installed import is_installed, require
 
 if TYPE_CHECKING:
     import torch
@@ -46,8 +47,10 @@ def flip_map(image: Image, truth: Image) -> npt.NDArray[np.float32]:
 def find_vgg_weights(given: str | None) -> Path | None:
     """The file with VGG-16's weights: the given one, else torch's cached one, else None.
 
+    None also where there is a cached one but no torch to read it.
+
     Raises:
-        RequestError: the given file does not exist.
+        RequestError: the given file does not exist, or what reads it is not installed.
     """
     if given is not None:
         path = Path(given).expanduser()
@@ -56,7 +59,10 @@ def find_vgg_weights(given: str | None) -> Path | None:
                 f"evaluate.lpips_weights: there is no file {path}. Give torchvision's weights of "
                 f"VGG-16 ({VGG_FILE}), or leave the setting out: lpips is then not computed."
             )
+        require("evaluate.lpips_weights", "torch", "torch", "torchmetrics")
         return path
+    if not is_installed("torch", "torchmetrics"):
+        return None
     import os
 
     cache = os.environ.get("TORCH_HOME") or (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
+from pipeline.installed import library_version
 from pipeline.stage import Parts, Stage, StageConfig, StageContext
 
 if TYPE_CHECKING:
@@ -300,7 +300,7 @@ def _describe(
         similarity=scene.frame_from_world.tolist(),
         counts=counts,
         skipped=skipped,
-        versions={name: version(name) for name in ("dentalsplat", *libraries)},
+        versions={name: library_version(name) for name in ("dentalsplat", *libraries)},
     )
     write_json(folder / "scene.json", description)
     (folder / "README.txt").write_text(readme(description))

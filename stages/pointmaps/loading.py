@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from pipeline.errors import RequestError
+from pipeline.installed import require
 from stages.pointmaps.interface import ModelCard
 
 
@@ -73,8 +74,9 @@ def choose_device(name: str) -> Any:
     """A torch device; "auto" is CUDA if there is one.
 
     Raises:
-        RequestError: no such device here.
+        RequestError: no such device here, or no torch.
     """
+    require("A pointmap model", "torch", "torch")
     import torch
 
     if name == "auto":

@@ -217,7 +217,7 @@ def test_wrong_presets_and_settings_are_refused_before_anything_runs(
     def setting(suite: dict[str, Any]) -> None:
         suite["methods"][1]["overrides"] = {"fit.qualty": 1}
 
-    for change, text in ((preset, "Did you mean 'dentalsplat'"), (setting, "'quality'")):
+    for change, text in ((preset, "Did you mean 'dentalsplat'"), (setting, "fit.quality")):
         with pytest.raises(RequestError, match="The method 'poor' of the suite") as error:
             bench(change)
         assert text in str(error.value)

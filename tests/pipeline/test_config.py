@@ -22,7 +22,7 @@ def test_override_reaches_the_stage(toys: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "text"),
     [
-        ("scale.factr=3", r"'scale.factr' is not a setting. Did you mean 'factor'\?"),
+        ("scale.factr=3", r"'scale.factr' is not a setting. Did you mean scale.factor"),
         ("scal.factor=3", r"'scal' is neither a stage nor a setting.*Did you mean 'scale'\?"),
         ("scale.factor=70", r"scale.factor=70 is not allowed: .*less than 10.*multiply with"),
         ("scale.factor=many", r"scale.factor='many' is not allowed: .*number"),

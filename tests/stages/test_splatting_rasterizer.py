@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.liegroup import Se3
 
 from stages.splatting import reference
 from stages.splatting.rasterizer import Viewpoint, rasterize
@@ -30,12 +31,7 @@ def one_torch_thread():
 
 def exponential(twist: torch.Tensor) -> torch.Tensor:
     """exp of a twist (translation, rotation) as a 4x4 matrix."""
-    v, w = twist[:3], twist[3:]
-    zero = torch.zeros((), dtype=twist.dtype)
-    rows = [
-        [zero, -w[2], w[1], v[0]], [w[2], zero, -w[0], v[1]], [-w[1], w[0], zero, v[2]], [zero] * 4
-    ]  # fmt: skip
-    return torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
+    return Se3.exp(twist).matrix()
 
 
 def scene(seed: int, count: int = 60) -> np.ndarray:
@@ -95,7 +91,7 @@ VARIANTS = [
 def poses() -> tuple[np.ndarray, np.ndarray]:
     first = exponential(torch.tensor([0.1, -0.05, 0.2, 0.1, -0.2, 0.05], dtype=torch.float64))
     second = exponential(torch.tensor([-0.2, 0.1, 0.3, 0.0, 0.15, -0.1], dtype=torch.float64))
-    return first.numpy(), second.numpy()
+    return first.detach().numpy(), second.detach().numpy()
 
 
 def viewpoint(pose: np.ndarray, intrinsics: tuple[float, ...] = INTRINSICS) -> Viewpoint:

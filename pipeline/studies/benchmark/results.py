@@ -53,12 +53,13 @@ A table is one table of the suite with its grids, which are ready to print::
 
 from __future__ import annotations
 
-import os
 import platform
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from pipeline.installed import library_version
+from pipeline.measure import usable_cores
 
 FORMAT = 1
 
@@ -70,10 +71,7 @@ def versions_in_use(libraries: set[str]) -> dict[str, str]:
     """Versions of Python, of dentalsplat and of the libraries that stages name."""
     found = {"python": platform.python_version()}
     for name in ("dentalsplat", *sorted(libraries)):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "missing"
+        found[name] = library_version(name)
     return found
 
 
@@ -87,7 +85,7 @@ def machine(jobs: int, threads: int) -> dict[str, Any]:
                 break
     return {
         "processor": processor,
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": usable_cores(),
         "jobs": jobs,
         "threads": threads,
     }

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +16,8 @@ from filelock import FileLock, Timeout
 from pipeline.config import parse_override
 from pipeline.errors import RequestError
 from pipeline.files import read_json, write_json
+from pipeline.installed import module_command
+from pipeline.measure import usable_cores
 from pipeline.stage import get_stage
 from pipeline.store import Store
 from pipeline.studies.benchmark.cells import (
@@ -34,7 +34,7 @@ from pipeline.studies.benchmark.tables import build_table, paper_note
 from pipeline.studies.benchmark.writing import write_tables
 
 #: How the process of one cell is started.
-WORKER = (sys.executable, "-m", "pipeline.studies.benchmark.worker")
+WORKER = module_command("pipeline.studies.benchmark.worker")
 
 Say = Callable[[str], None]
 
@@ -74,7 +74,7 @@ def benchmark(
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
     cells, tables = plan_cells(loaded, dict(pairs))
     folder = Path(out) if out is not None else Path("runs") / f"benchmark_{loaded.path.stem}"
-    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
+    threads = max(1, usable_cores() // jobs)
     with _only_one(folder.absolute()) as place:
         records = _run_all(cells, place, jobs, threads, say or (lambda text: None))
         results = _results(loaded, cells, tables, records, machine(jobs, threads))

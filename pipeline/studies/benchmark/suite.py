@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from pipeline.config import DEFAULT_PRESET, preset_folder, read_yaml, validate
+from pipeline.config import DEFAULT_PRESET, read_yaml, validate
 from pipeline.errors import RequestError, nearest
+from pipeline.installed import shipped_configs
 from pipeline.studies.benchmark.paper import ROWS
 
 #: Names become names of folders and files.
@@ -153,7 +154,7 @@ class LoadedSuite:
 
 def suites() -> dict[str, Path]:
     """The suites that come with dentalsplat: name -> file."""
-    return {path.stem: path for path in sorted(preset_folder().glob("suites/*.yaml"))}
+    return {path.stem: path for path in sorted(shipped_configs().glob("suites/*.yaml"))}
 
 
 def load_suite(suite: str | Path, data: str | Path | None = None) -> LoadedSuite:

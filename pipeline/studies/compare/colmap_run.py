@@ -24,6 +24,7 @@ from pipeline.artifacts.views import View, to_uint8, write_png
 from pipeline.errors import RequestError
 from pipeline.files import canonical_json, content_hash, folder_listing, read_json, write_json
 from pipeline.geometry.models.colmap import quiet_pycolmap
+from pipeline.installed import module_command
 
 #: COLMAP's options by step: what differs from its defaults.
 Options = Mapping[str, Mapping[str, Any]]
@@ -180,7 +181,7 @@ def run_job(folder: Path, job: Job) -> dict[str, Any]:
     begin = time.perf_counter()
     with (folder / "log.txt").open("w") as log:
         ended = subprocess.run(
-            [sys.executable, "-m", "pipeline.studies.compare.colmap_run", str(folder)],
+            [*module_command("pipeline.studies.compare.colmap_run"), str(folder)],
             stdout=log, stderr=subprocess.STDOUT, check=False,
         )  # fmt: skip
     seconds = round(time.perf_counter() - begin, 2)

@@ -12,6 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.files import read_json, write_atomic, write_json
+from pipeline.measure import usable_cores
 from pipeline.pages.page import REPORT
 from pipeline.runner import Reporter
 from pipeline.store import CorruptResultError, Result, Store
@@ -95,10 +96,8 @@ def compare(
     Raises:
         RequestError: no such workspace or files, or nothing to compare with.
     """
-    import os
-
     home, reporter = Path(workspace), reporter or Reporter()
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or usable_cores()
     store, prepared = _workspace(home)
     views = _loaded(store, prepared, "views").views
     _check(colmap, run_colmap, ground_truth, mesh)

@@ -1,0 +1,101 @@
+"""What the pages show works: commands parse, settings and files exist, examples run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from pipeline.cli import app
+from pipeline.config import load_config, presets
+from pipeline.front.settings import settings
+from pipeline.stage import stage_names
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    return [text for language, text in FENCE.findall(page.read_text()) if language in languages]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The arguments of every ``pipeline ...`` in a page's blocks."""
+    found = []
+    for block in blocks(page, "", "bash"):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words and Path(words[0]).name in ("pipeline", "dentalsplat"):
+                found.append(words[1:])
+    return found
+
+
+SHOWN = [(page.name, words) for page in PAGES for words in commands(page)]
+
+
+@pytest.mark.parametrize(("page", "words"), SHOWN, ids=lambda value: str(value)[:60])
+def test_commands_parse(page: str, words: list[str]) -> None:
+    name, *arguments = words
+    group: Any = typer.main.get_command(app)
+    command = group.commands[name]
+    context = command.make_context(name, arguments)
+    load_config(None, context.params.get("overrides") or [])
+    preset = context.params.get("config")
+    assert preset is None or preset in presets() or preset.endswith(".yaml")
+    # "thin" is the stage that docs/extending.md shows how to write
+    stages = (context.params.get("stages") or context.params.get("from_stage") or "").split(",")
+    assert set(filter(None, stages)) <= {*stage_names(), "thin"}
+
+
+def test_enough_is_shown() -> None:
+    assert len(SHOWN) > 30
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_targets_of_make_exist(page: Path) -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"`?make ([a-z-]+)", "\n".join(blocks(page, ""))):
+        assert f"\n{target}:" in makefile
+
+
+def test_examples_of_extending_run(tmp_path: Path) -> None:
+    page = ROOT / "docs" / "extending.md"
+    names: dict[str, Any] = {}
+    for block in blocks(page, "python"):
+        exec(compile(block, str(page), "exec"), names)
+    names["Heights"]({"11": 9.5}).save(tmp_path)
+    assert names["Heights"].load(tmp_path).by_tooth == {"11": 9.5}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_files_exist(page: Path) -> None:
+    for name in re.findall(
+        r"`((?:stages|pipeline|configs|tools|docs|data_samples)/[\w/.-]+\.\w+)`", page.read_text()
+    ):
+        assert (ROOT / name).exists() or "fit/parts" in name, f"{page.name}: {name}"
+
+
+def test_pages_made_from_the_code_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import docs_pages
+
+    pages = {name: make() for name, make in docs_pages.PAGES.items()}
+    for setting in settings():
+        assert f"| `{setting.name}` |" in pages["settings.md"]
+    for stage in stage_names():
+        assert f"\n## {stage}\n" in pages["stages.md"]
+    assert "\n## gaussians\n" in pages["artifacts.md"]
+
+
+def test_code_cites_pages_that_exist() -> None:
+    for package in ("dentalsplat", "pipeline", "stages", "tools"):
+        for path in (ROOT / package).rglob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            assert "DESIGN" not in text, path
+            for name in re.findall(r"docs/\w+\.md", text):
+                assert (ROOT / name).is_file(), f"{path}: {name}"
