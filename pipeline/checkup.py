@@ -150,12 +150,18 @@ def _processor() -> Iterator[Finding]:
 
 
 def _numba_cache() -> Iterator[Finding]:
-    folder = Path(__file__).resolve().parents[1] / "stages" / "splatting"
-    writable = os.access(folder, os.W_OK) or bool(os.environ.get("NUMBA_CACHE_DIR"))
-    yield Finding(
-        "kernel cache", "ok" if writable else "note",
-        "compiled kernels are kept" if writable else "kernels are kept in your home folder",
-    )  # fmt: skip
+    from pipeline.kernels.folder import SUFFIX, folders, readable, writable
+
+    folder = writable()
+    if folder is None:
+        yield Finding(
+            "kernel cache", "note", "every run compiles its kernels anew: "
+            f"{' and '.join(map(str, folders()))} can't be written",
+            "NUMBA_CACHE_DIR=FOLDER names another place for compiled kernels.",
+        )  # fmt: skip
+        return
+    number = len({path.name for place in readable() for path in place.glob(f"*{SUFFIX}")})
+    yield Finding("kernel cache", "ok", f"{number} compiled kernels in {folder}")
 
 
 def _gpu() -> Iterator[Finding]:
