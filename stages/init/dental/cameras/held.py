@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.kernels import kernel
 from stages.init.dental.cameras.algebra import (
     cholesky,
     eliminate,
@@ -99,11 +99,9 @@ def nearest_similarity(
     return np.ascontiguousarray(rotation), centre, float(np.log(scale))
 
 
-@njit(
+@kernel(
     "void(float64[:,::1], float64[::1], float64, float64[:,:,::1], float64[:,::1],"
     " float64[:,:,::1], float64[:,::1], float64, float64[::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def unknowns_of(  # type: ignore[no-untyped-def]
@@ -127,11 +125,9 @@ def unknowns_of(  # type: ignore[no-untyped-def]
         x[PER_VIEW * v + 6] = 0.0
 
 
-@njit(
+@kernel(
     "void(float64, float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
     " float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
@@ -151,13 +147,11 @@ def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type
         T[PER_VIEW * views + k, PER_SIMILARITY + k] = 1
 
 
-@njit(
+@kernel(
     "UniTuple(float64, 2)(float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64,"
     " float64[:,:,::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1], float64[:,::1],"
     " float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1], float64, float64,"
     " float64[::1], float64[::1], int64, float64, float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def minimise_held(  # type: ignore[no-untyped-def]
