@@ -99,6 +99,8 @@ class Stage(ABC):
         libraries: distributions whose versions can change the result, so that they enter the key.
         methods: value of the config field `method` -> one line about it, where there is a choice.
         uses_sources: True for a stage that reads the photographs (they are part of its key).
+        rehearsals: functions, as ``module:name``, that run the stage's numba kernels on something
+            tiny to have them compiled; called side by side, in processes of their own.
         prepares: True for a quick stage that only says more of the photographs: it runs whenever
             they are named, even where the stages named leave it out.
     """
@@ -114,6 +116,7 @@ class Stage(ABC):
     libraries: ClassVar[tuple[str, ...]] = ()
     methods: ClassVar[Mapping[str, str]] = {}
     uses_sources: ClassVar[bool] = False
+    rehearsals: ClassVar[tuple[str, ...]] = ()
     prepares: ClassVar[bool] = False
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
@@ -132,6 +135,13 @@ class Stage(ABC):
     def findings(self) -> Iterable[Finding]:
         """What `pipeline doctor` should say of this stage: optional parts that are there or not."""
         return ()
+
+    def backend(self, config: Any) -> str:
+        """Which of several ways to the result this machine takes, where results differ by it.
+
+        It enters the key: what ``auto`` comes to is not said by the config.
+        """
+        return ""
 
     @abstractmethod
     def run(self, context: StageContext) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.flow import Flow
@@ -31,6 +31,15 @@ class FitStage(Stage):
         "opencv-contrib-python-headless",
         "scipy",
     )
+    rehearsals: ClassVar[tuple[str, ...]] = (
+        "stages.fit.rehearsal:rasterizer",
+        "stages.fit.rehearsal:whole_fits",
+    )
+
+    def backend(self, config: Any) -> str:
+        from stages.fit.backend import expected_backend
+
+        return expected_backend(config)
 
     def run(self, context: StageContext) -> None:
         from stages.fit.fitting import fit
@@ -66,7 +75,7 @@ class FitStage(Stage):
 
         diary = context.scratch / "diary"
         diary.mkdir(parents=True, exist_ok=True)
-        context.progress("preparing (a first run compiles its kernels)", 0, 1)
+        context.progress("preparing", 0, 1)
         result = fit(
             placed, placed_cameras, points, flow, settings,
             threads=context.threads, checkpoint=context.scratch / "fit.npz", report=report,
