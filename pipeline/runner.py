@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
+from pipeline.kernels.news import told_to
+from pipeline.kernels.rehearsals import Background
 from pipeline.measure import Measurement
 from pipeline.planning import (
     Input,
@@ -181,13 +184,14 @@ class Runner:
     def run(self, *, force: bool = False, dry_run: bool = False) -> RunSummary:
         if dry_run:
             return self._dry_run(force)
-        self.plan()  # a wrong request is refused before anything is written
+        planned = self.plan()  # a wrong request is refused before anything is written
         self.store.create()
         self.request.save()
         self.reporter.start(list(self.chain.names))
         try:
             self._check_upstream()
-            summary = self._run_all(force)
+            with self._kernels(stage.name for stage in planned if force or stage.result is None):
+                summary = self._run_all(force)
             summary.report = self._write_report()
             summary.check = self._check_page() if summary.report else None
             return summary
@@ -201,6 +205,28 @@ class Runner:
             raise
         finally:
             self.reporter.stop()
+
+    @contextlib.contextmanager
+    def _kernels(self, stages: Iterable[str]) -> Iterator[None]:
+        """Compile kernels of later stages beside the earlier ones, and say it where one waits."""
+        background = Background()
+        told: set[str] = set()
+
+        def tell(kernel: str) -> None:
+            if not told:
+                self.reporter.message(
+                    "Kernels are compiled for this processor, once: this run takes up to a minute "
+                    "longer than the next."
+                )
+            told.add(kernel)
+
+        try:
+            with told_to(tell):
+                if self.config.threads > 1:
+                    background.start(stages, processes=self.config.threads)
+                yield
+        finally:
+            background.stop()
 
     def _write_report(self) -> Path | None:
         """Write the report; whatever goes wrong with it is said, and harms nothing else."""
