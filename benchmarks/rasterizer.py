@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
-from stages.splatting import raster
 from stages.splatting.adam import Adam
+from stages.splatting.kernels import compositing as raster
 from stages.splatting.loss import ColourLoss
 from stages.splatting.rasterizer import ALPHA_CUT, Rendering, Viewpoint, rasterize, use_threads
 from stages.splatting.threads import workers

@@ -31,6 +31,7 @@ dentalsplat turns a few photographs of teeth into a 3D scene that you can turn a
   pipeline compare -w cases/anna --run-colmap       beside COLMAP on the same photographs
   pipeline benchmark smoke                  methods side by side, in the paper's tables
   pipeline doctor                           is everything installed?
+  pipeline warmup                           compile the kernels ahead (for an image)
   pipeline clean -w cases/anna              delete results that are not in use
 
 When a run ends, open WORKSPACE/results/viewer.html in a browser. 'pipeline run --help' says more.
@@ -206,6 +207,27 @@ def doctor_command(as_json: AsJson = False) -> None:
     else:
         print_findings(found)
     if any(entry.level == "problem" for entry in found):
+        raise typer.Exit(1)
+
+
+@app.command("warmup")
+def warmup_command() -> None:
+    """Compile the kernels of all stages ahead, as for an image; a first run does it by itself.
+
+    They are kept beside the program where that can be written, so that all users have them.
+    """
+    from pipeline.kernels import folder
+    from pipeline.kernels.rehearsals import Background
+    from pipeline.stage import usable_stages
+
+    background = Background()
+    try:
+        background.start(usable_stages(), processes=len(os.sched_getaffinity(0)))
+        well = background.wait()
+    finally:
+        background.stop()
+    print(f"Compiled kernels: {folder.writable()}")
+    if not well:
         raise typer.Exit(1)
 
 

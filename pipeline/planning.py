@@ -172,15 +172,23 @@ def key_material(
 
     docs/architecture.md says why, under "The store".
     """
-    return {
+    section = config.sections[stage.name]
+    material = {
         "stage": stage.name,
         "version": stage.version,
-        "config": result_fields(config.sections[stage.name]),
+        "config": result_fields(section),
         "seed": config.run.seed,
         "inputs": {kind: entry.content for kind, entry in sorted(inputs.items())},
         "sources": [[label, digest] for label, digest in sources.items()],
-        "libraries": {name: library_version(name) for name in stage.libraries},
+        "libraries": {name: library_version(name) for name in _libraries(stage)},
     }
+    backend = stage.backend(section)
+    return {**material, "backend": backend} if backend else material
+
+
+def _libraries(stage: Stage) -> tuple[str, ...]:
+    """Those that a stage names, and llvmlite, which makes the code of numba's kernels."""
+    return (*stage.libraries, *(("llvmlite",) if "numba" in stage.libraries else ()))
 
 
 def key_of(material: dict[str, Any]) -> str:
@@ -306,9 +314,10 @@ def explain(
         was, now = old["libraries"].get(name), new["libraries"].get(name)
         if was != now:
             reasons.append(f"library {name} {was} → {now}")
-    for name in ("version", "seed"):
-        if old[name] != new[name]:
-            reasons.append(f"{stage} {name} {old[name]} → {new[name]}")
+    for name in ("version", "seed", "backend"):
+        if old.get(name) != new.get(name):
+            was, now = (entry.get(name, "(unknown)") for entry in (old, new))
+            reasons.append(f"{stage} {name} {was} → {now}")
     if old["sources"] != new["sources"] and not reasons:
         reasons.append("the order of the photographs changed")
     return reasons

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import traceback
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
+from pipeline.kernels.news import told_to
+from pipeline.kernels.rehearsals import Background
 from pipeline.measure import Measurement
 from pipeline.planning import (
     Input,
@@ -169,15 +173,38 @@ class Runner:
             RequestError: the request is wrong; nothing was written, or the disk is full.
             ReconstructionError: the data can't be reconstructed. StageError: a fault of ours.
         """
-        self.plan()  # a wrong request is refused before anything is written
+        planned = self.plan()  # a wrong request is refused before anything is written
         self.store.create()
         self.request.save()
         self.reporter.start(list(self.chain.names))
         try:
             self._check_upstream()
-            return self._run_all(force)
+            with self._kernels(stage.name for stage in planned if force or stage.result is None):
+                return self._run_all(force)
         finally:
             self.reporter.stop()
+
+    @contextlib.contextmanager
+    def _kernels(self, stages: Iterable[str]) -> Iterator[None]:
+        """Compile kernels of later stages beside the earlier ones, and say it where one waits."""
+        background = Background()
+        told: set[str] = set()
+
+        def tell(kernel: str) -> None:
+            if not told:
+                self.reporter.message(
+                    "Kernels are compiled for this processor, once: this run takes up to a minute "
+                    "longer than the next."
+                )
+            told.add(kernel)
+
+        try:
+            with told_to(tell):
+                if self.config.threads > 1:
+                    background.start(stages, processes=self.config.threads)
+                yield
+        finally:
+            background.stop()
 
     def dry_run(self, *, force: bool = False) -> RunSummary:
         """Only say what would be done."""

@@ -122,6 +122,8 @@ class Stage(ABC):
         libraries: distributions whose versions can change the result, so that they enter the key.
         methods: value of the config field `method` -> one line about it, where there is a choice.
         uses_sources: True for a stage that reads the photographs (they are part of its key).
+        rehearsals: functions, as ``module:name``, that run the stage's numba kernels on something
+            tiny to have them compiled; called side by side, in processes of their own.
         prepares: True for a quick stage that only says more of the photographs: it runs whenever
             they are named, even where the stages named leave it out.
         thrift: what a user can do where memory runs out, in a sentence.
@@ -138,6 +140,7 @@ class Stage(ABC):
     libraries: ClassVar[tuple[str, ...]] = ()
     methods: ClassVar[Mapping[str, str]] = {}
     uses_sources: ClassVar[bool] = False
+    rehearsals: ClassVar[tuple[str, ...]] = ()
     prepares: ClassVar[bool] = False
     thrift: ClassVar[str] = ""
 
@@ -165,6 +168,13 @@ class Stage(ABC):
         a module of its own, imported here.
         """
         return {}
+
+    def backend(self, config: Any) -> str:
+        """Which of several ways to the result this machine takes, where results differ by it.
+
+        It enters the key: what ``auto`` comes to is not said by the config.
+        """
+        return ""
 
     @abstractmethod
     def run(self, context: StageContext) -> None:

@@ -141,6 +141,21 @@ def _processor() -> Iterator[Finding]:
     )  # fmt: skip
 
 
+def _numba_cache() -> Iterator[Finding]:
+    from pipeline.kernels.folder import SUFFIX, folders, readable, writable
+
+    folder = writable()
+    if folder is None:
+        yield Finding(
+            "kernel cache", "note", "every run compiles its kernels anew: "
+            f"{' and '.join(map(str, folders()))} can't be written",
+            "NUMBA_CACHE_DIR=FOLDER names another place for compiled kernels.",
+        )  # fmt: skip
+        return
+    number = len({path.name for place in readable() for path in place.glob(f"*{SUFFIX}")})
+    yield Finding("kernel cache", "ok", f"{number} compiled kernels in {folder}")
+
+
 def _gpu() -> Iterator[Finding]:
     if shutil.which("nvidia-smi") is None:
         yield Finding("gpu", "ok", "none; not needed")

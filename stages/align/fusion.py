@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
 from pipeline.geometry.normals import depth_normals
+from pipeline.kernels import each, kernel, kernel_threads
 
 Array = npt.NDArray[np.float32]
 
@@ -65,106 +64,106 @@ class FusedCloud:
         return len(self.positions)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _fuse_view(  # type: ignore[no-untyped-def]
-    index, depths, confidences, images, cameras, fill_confidence, relative, front,
+@kernel(nogil=True)
+def _fuse_row(  # type: ignore[no-untyped-def]
+    y, index, depths, confidences, images, cameras, fill_confidence, relative, front,
     min_agreeing, merge, keep, depth_out, color_out, residual_out,
 ):  # fmt: skip
+    """`fuse` for one row of one view."""
     here = cameras[index]
     views = depths.shape[0]
-    for y in prange(keep.shape[0]):
-        colors = np.empty((views, 3), np.float32)
-        lumas = np.empty(views, np.float32)
-        weights = np.empty(views, np.float32)
-        for x in range(keep.shape[1]):
-            z = np.float64(depths[index, y, x])
-            own = confidences[index, y, x]
-            if z <= 0 or own <= np.float32(1):
+    colors = np.empty((views, 3), np.float32)
+    lumas = np.empty(views, np.float32)
+    weights = np.empty(views, np.float32)
+    for x in range(keep.shape[1]):
+        z = np.float64(depths[index, y, x])
+        own = confidences[index, y, x]
+        if z <= 0 or own <= np.float32(1):
+            continue
+        is_fill = own <= fill_confidence
+        a = (x + 0.5 - here[2]) / here[0] * z - here[15]
+        b = (y + 0.5 - here[3]) / here[1] * z - here[16]
+        c = z - here[17]
+        X = here[6] * a + here[9] * b + here[12] * c
+        Y = here[7] * a + here[10] * b + here[13] * c
+        Z = here[8] * a + here[11] * b + here[14] * c
+        weights[0] = own - np.float32(1)
+        for k in range(3):
+            colors[0, k] = images[index, y, x, k]
+        lumas[0] = colors[0].sum()
+        mass = np.float64(own) - 1
+        mean = z * mass
+        residual = 0.0
+        agree = 0
+        refuted = 0
+        explained = False
+        for v in range(views):
+            if v == index:
                 continue
-            is_fill = own <= fill_confidence
-            a = (x + 0.5 - here[2]) / here[0] * z - here[15]
-            b = (y + 0.5 - here[3]) / here[1] * z - here[16]
-            c = z - here[17]
-            X = here[6] * a + here[9] * b + here[12] * c
-            Y = here[7] * a + here[10] * b + here[13] * c
-            Z = here[8] * a + here[11] * b + here[14] * c
-            weights[0] = own - np.float32(1)
+            there = cameras[v]
+            zv = there[12] * X + there[13] * Y + there[14] * Z + there[17]
+            if zv <= 1e-9:
+                continue
+            p = there[6] * X + there[7] * Y + there[8] * Z + there[15]
+            q = there[9] * X + there[10] * Y + there[11] * Z + there[16]
+            j = np.int64(np.floor(there[0] * p / zv + there[2]))
+            i = np.int64(np.floor(there[1] * q / zv + there[3]))
+            if i < 0 or j < 0 or i >= there[5] or j >= there[4]:
+                continue
+            seen = np.float64(depths[v, i, j])
+            other = confidences[v, i, j]
+            if seen <= 0 or other <= np.float32(1):
+                continue
+            other_fill = other <= fill_confidence
+            if other_fill and not is_fill:
+                continue  # a guess says nothing about a measurement
+            if zv < seen * (1 - front) and not other_fill:
+                refuted += 1
+                continue
+            # Fill is smooth and rough at once: what lies near it is it.
+            within = 4 * relative if is_fill else relative
+            if abs(seen - zv) > within * zv:
+                continue
+            if other > own or (other == own and v < index) or (is_fill and not other_fill):
+                explained = True
+            agree += 1
+            residual += abs(seen - zv) / zv
+            weight = np.float64(other) - 1
+            mean += weight * (z + (seen - zv) * z / zv)
+            mass += weight
+            weights[agree] = other - np.float32(1)
             for k in range(3):
-                colors[0, k] = images[index, y, x, k]
-            lumas[0] = colors[0].sum()
-            mass = np.float64(own) - 1
-            mean = z * mass
-            residual = 0.0
-            agree = 0
-            refuted = 0
-            explained = False
-            for v in range(views):
-                if v == index:
-                    continue
-                there = cameras[v]
-                zv = there[12] * X + there[13] * Y + there[14] * Z + there[17]
-                if zv <= 1e-9:
-                    continue
-                p = there[6] * X + there[7] * Y + there[8] * Z + there[15]
-                q = there[9] * X + there[10] * Y + there[11] * Z + there[16]
-                j = np.int64(np.floor(there[0] * p / zv + there[2]))
-                i = np.int64(np.floor(there[1] * q / zv + there[3]))
-                if i < 0 or j < 0 or i >= there[5] or j >= there[4]:
-                    continue
-                seen = np.float64(depths[v, i, j])
-                other = confidences[v, i, j]
-                if seen <= 0 or other <= np.float32(1):
-                    continue
-                other_fill = other <= fill_confidence
-                if other_fill and not is_fill:
-                    continue  # a guess says nothing about a measurement
-                if zv < seen * (1 - front) and not other_fill:
-                    refuted += 1
-                    continue
-                # Fill is smooth and rough at once: what lies near it is it.
-                within = 4 * relative if is_fill else relative
-                if abs(seen - zv) > within * zv:
-                    continue
-                if other > own or (other == own and v < index) or (is_fill and not other_fill):
-                    explained = True
-                agree += 1
-                residual += abs(seen - zv) / zv
-                weight = np.float64(other) - 1
-                mean += weight * (z + (seen - zv) * z / zv)
-                mass += weight
-                weights[agree] = other - np.float32(1)
-                for k in range(3):
-                    colors[agree, k] = images[v, i, j, k]
-                lumas[agree] = colors[agree].sum()
-            if refuted > agree or (is_fill and refuted > 0):
-                continue
-            if explained and merge:
-                continue
-            if not is_fill and agree < min_agreeing:
-                continue
-            keep[y, x] = 2 if is_fill else 1
-            depth_out[y, x] = np.float32(z if is_fill else mean / mass)
-            residual_out[y, x] = np.float32(residual / agree if agree > 0 else -1)
-            # Highlights move with the camera and are brighter than the surface: from the weighted
-            # median by luma (the darker one of two), take the mean of all that look like it.
-            count = agree + 1
-            order = np.argsort(lumas[:count])
-            half = np.float32(0.5) * weights[:count].sum()
-            running = np.float32(0)
-            chosen = order[0]
-            for k in range(count):
-                running += weights[order[k]]
-                if running >= half or k == (count - 1) // 2:
-                    chosen = order[k]
-                    break
-            total = np.float32(0)
-            for k in range(count):
-                if abs(lumas[k] - lumas[chosen]) <= _ALIKE:
-                    total += weights[k]
-                    for q in range(3):
-                        color_out[y, x, q] += weights[k] * colors[k, q]
-            for q in range(3):
-                color_out[y, x, q] /= total
+                colors[agree, k] = images[v, i, j, k]
+            lumas[agree] = colors[agree].sum()
+        if refuted > agree or (is_fill and refuted > 0):
+            continue
+        if explained and merge:
+            continue
+        if not is_fill and agree < min_agreeing:
+            continue
+        keep[y, x] = 2 if is_fill else 1
+        depth_out[y, x] = np.float32(z if is_fill else mean / mass)
+        residual_out[y, x] = np.float32(residual / agree if agree > 0 else -1)
+        # Highlights move with the camera and are brighter than the surface: from the weighted
+        # median by luma (the darker one of two), take the mean of all that look like it.
+        count = agree + 1
+        order = np.argsort(lumas[:count])
+        half = np.float32(0.5) * weights[:count].sum()
+        running = np.float32(0)
+        chosen = order[0]
+        for k in range(count):
+            running += weights[order[k]]
+            if running >= half or k == (count - 1) // 2:
+                chosen = order[k]
+                break
+        total = np.float32(0)
+        for k in range(count):
+            if abs(lumas[k] - lumas[chosen]) <= _ALIKE:
+                total += weights[k]
+                for q in range(3):
+                    color_out[y, x, q] += weights[k] * colors[k, q]
+        for q in range(3):
+            color_out[y, x, q] /= total
 
 
 def _camera_rows(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
@@ -219,21 +218,18 @@ def fuse(
         confidence_stack[v, :h, :w] = confidences[v]
         image_stack[v, :h, :w] = images[v]
     table = _camera_rows(cameras)
-    before = numba.get_num_threads()
-    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    numba.set_num_threads(max(1, min(threads, available)))
     parts: list[tuple[Array, ...]] = []
     residuals = []
     fill = 0
-    try:
+    with kernel_threads(threads):
         for v, camera in enumerate(cameras):
             shape = depths[v].shape
             keep = np.zeros(shape, np.uint8)
             depth = np.zeros(shape, np.float32)
             color = np.zeros((*shape, 3), np.float32)
             residual = np.full(shape, -1, np.float32)
-            _fuse_view(
-                v, depth_stack, confidence_stack, image_stack, table,
+            each(
+                _fuse_row, shape[0], v, depth_stack, confidence_stack, image_stack, table,
                 np.float32(options.fill_confidence), float(options.relative_depth),
                 float(options.front), int(options.min_agreeing), bool(options.merge),
                 keep, depth, color, residual,
@@ -254,8 +250,6 @@ def fuse(
                 )
             )
             progress(v + 1, count)
-    finally:
-        numba.set_num_threads(before)
     positions, colors, normals, trust = (np.concatenate(a) for a in zip(*parts, strict=True))
     agreed = np.concatenate(residuals)
     residual_median = float(np.median(agreed)) if len(agreed) else float("nan")

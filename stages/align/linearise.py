@@ -9,7 +9,8 @@ would be scaled by an unknown, and shrink with it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from pipeline.kernels import kernel
 
 #: Unknowns of a camera: rotation, translation, log focal length.
 CAMERA = 7
@@ -17,7 +18,7 @@ CAMERA = 7
 PAIR = 7
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def linearise_view(  # type: ignore[no-untyped-def]
     pixels, log_depth, rotation, translation, focal, pair_rotation, pair_scale, pair_shift,
     points, weight, inverse_distance, delta,

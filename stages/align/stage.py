@@ -122,6 +122,7 @@ class AlignStage(Stage):
     optional = ("cameras", "points")  # points: kept where there are no pointmaps to fuse
     provides = ("cameras", "points")
     libraries = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
+    rehearsals = ("stages.align.rehearsal:fusion",)
 
     def run(self, context: StageContext) -> None:
         import numpy as np

@@ -83,7 +83,7 @@ def describe_light(light: Light | None, orbit: Orbit) -> dict[str, Any] | None:
 
 def rasterizer_constants(gaussians: Gaussians, cameras: Sequence[Camera]) -> dict[str, float]:
     """The constants of our rasterizer, with its near plane for a typical camera of the scene."""
-    from stages.splatting.raster import ALPHA_MAX
+    from stages.splatting.kernels.compositing import ALPHA_MAX
     from stages.splatting.rasterizer import ALPHA_CUT, LOW_PASS
     from stages.splatting.rendering import NEAR_FRACTION
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import RequestError
-from stages.fit.settings import FitSettings
-from stages.splatting.rasterizer import rasterize
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
@@ -27,6 +26,19 @@ def has_card() -> bool:
     from stages.splatting.torch_api import choose_backend
 
     return choose_backend() == "gsplat"
+
+
+def expected_backend(config: Any) -> str:
+    """What a fit with this `FitConfig` will run on here: ``"cpu"``, or gsplat on which card.
+
+    Only a card that turns out to be out of order is not foreseen; the fit then says so.
+    """
+    if config.backend == "cpu" or _obstacle(config) is not None:
+        return "cpu"
+    import torch
+
+    versions = ", ".join(f"{name} {version(name)}" for name in ("gsplat", "torch"))
+    return f"{torch.cuda.get_device_name()}, {versions}"
 
 
 def use_backend(trainer: Trainer) -> str | None:
@@ -53,10 +65,11 @@ def use_backend(trainer: Trainer) -> str | None:
     return f"The fit ran on the processor although there is a card: {why}."
 
 
-def _obstacle(s: FitSettings) -> str | None:
+def _obstacle(s: Any) -> str | None:
+    """Why settings, or a config, can't be had on a card."""
     if s.optimize_focal:
         return "it gives no gradient by the focal length (fit.optimize_focal)"
-    if s.progressive:
+    if s.progressive is True:
         return "views that are placed one by one are placed by the processor (fit.progressive)"
     if not has_card():
         return "there is no gsplat (install dentalsplat[gpu]) or no card that torch can use"
@@ -71,6 +84,8 @@ def _card() -> Any:
 
 def _disagreement(trainer: Trainer) -> str | None:
     """What is different on the card in the first view, or None."""
+    from stages.splatting.rasterizer import rasterize
+
     target = trainer.targets[0][1]
     viewpoint = trainer.viewpoint(0, target)
     if trainer.light is not None:

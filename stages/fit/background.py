@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import kernel
 from stages.fit.settings import FitSettings
 from stages.fit.targets import Target
 from stages.splatting.threads import KERNELS
@@ -17,7 +18,7 @@ Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _lay_over(  # type: ignore[no-untyped-def]
     image: Floats, transmittance: Floats, colour: Floats, result: Floats
 ):
@@ -29,7 +30,7 @@ def _lay_over(  # type: ignore[no-untyped-def]
             result[channel, y, x] = image[channel, y, x] + transmittance[y, x] * behind
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _pull_back(  # type: ignore[no-untyped-def]
     d_image: Floats, transmittance: Floats, colour: Floats, d_transmittance: Floats, sums: Array
 ):

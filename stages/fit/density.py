@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import kernel
 from stages.splatting.threads import KERNELS
 
 Floats = npt.NDArray[np.float32]
@@ -20,7 +21,7 @@ SPLIT_SHRINK = 1.6
 CHUNK = 4096
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _accumulate(  # type: ignore[no-untyped-def]
     centres: Floats, absolute: Floats, visible: Bools, half_width: np.float32,
     half_height: np.float32, signed_sum: Floats, absolute_sum: Floats, seen: Floats,

@@ -14,7 +14,7 @@ from stages.fit.light_evidence import prediction_errors
 from stages.fit.scene import Scene
 from stages.fit.settings import FitSettings
 from stages.fit.trainer import Trainer
-from stages.splatting.projection import HARMONICS
+from stages.splatting.kernels.projection import HARMONICS
 
 #: points of less confidence are guesses, even where a held surface is made of them
 MEASURED = 1.5

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import kernel
 from stages.splatting.rasterizer import Rendering
 from stages.splatting.threads import KERNELS
 
@@ -21,7 +22,7 @@ MIN_ALPHA = F(0.5)
 SMOOTH = F(1e-8)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _compare_depth(  # type: ignore[no-untyped-def]
     plane: Floats, transmittance: Floats, depth: Floats, sums: Doubles
 ):
@@ -38,7 +39,7 @@ def _compare_depth(  # type: ignore[no-untyped-def]
         sums[y, 1] = total
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _pull_to_depth(  # type: ignore[no-untyped-def]
     plane: Floats, transmittance: Floats, depth: Floats, weight: np.float32, d_plane: Floats,
     d_transmittance: Floats,
@@ -69,7 +70,7 @@ def depth_loss(
     return float(total) / count
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _compare_flow(  # type: ignore[no-untyped-def]
     planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, sums: Doubles
 ):
@@ -88,7 +89,7 @@ def _compare_flow(  # type: ignore[no-untyped-def]
         sums[y, 1] = total
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _pull_to_flow(  # type: ignore[no-untyped-def]
     planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, weight: np.float32,
     d_planes: Floats, d_transmittance: Floats,

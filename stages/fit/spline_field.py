@@ -11,8 +11,9 @@ import itertools
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sparse
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import helper, inlined, kernel
 from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +27,7 @@ PARTS = 16
 REFINEMENT = (0.25, 0.75, 0.75, 0.25)
 
 
-@njit(inline="always")
+@inlined
 def _along(t):  # type: ignore[no-untyped-def]
     """The three splines at `t` spacings (-0.5..0.5) from the middle one, and their slopes."""
     low, high = F(0.5) - t, F(0.5) + t
@@ -34,7 +35,7 @@ def _along(t):  # type: ignore[no-untyped-def]
     return values, (-low, F(-2) * t, high)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _evaluate_some(  # type: ignore[no-untyped-def]
     nodes: Integers, offsets: Floats, inverse: np.float32, coefficients: Floats, result: Floats
 ):
@@ -60,7 +61,7 @@ def _evaluate_some(  # type: ignore[no-untyped-def]
         result[i, 3] = z * inverse
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _gather_some(  # type: ignore[no-untyped-def]
     nodes: Integers, offsets: Floats, inverse: np.float32, gradient: Floats, sums: Floats
 ):
@@ -78,7 +79,7 @@ def _gather_some(  # type: ignore[no-untyped-def]
                     sums[nodes[i, 9 * a + 3 * b + c]] += plain * wz[c] + steep * sz[c]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _evaluate(  # type: ignore[no-untyped-def]
     nodes: Integers, offsets: Floats, inverse: np.float32, coefficients: Floats, result: Floats
 ):
@@ -89,7 +90,7 @@ def _evaluate(  # type: ignore[no-untyped-def]
         _evaluate_some(nodes[rows], offsets[rows], inverse, coefficients, result[rows])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _gather(  # type: ignore[no-untyped-def]
     nodes: Integers, offsets: Floats, inverse: np.float32, gradient: Floats, parts: Floats
 ):

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Iterable
-from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.flow import Flow
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
-from pipeline.stage import Finding, Parts, Stage, StageConfig, StageContext
+from pipeline.stage import Parts, Stage, StageConfig, StageContext
 from stages.fit.config import FitConfig
 
 
@@ -34,14 +31,15 @@ class FitStage(Stage):
         "opencv-contrib-python-headless",
         "scipy",
     )
+    rehearsals: ClassVar[tuple[str, ...]] = (
+        "stages.fit.rehearsal:rasterizer",
+        "stages.fit.rehearsal:whole_fits",
+    )
 
-    def findings(self) -> Iterable[Finding]:
-        kernels = Path(__file__).resolve().parents[1] / "splatting"
-        kept = os.access(kernels, os.W_OK) or bool(os.environ.get("NUMBA_CACHE_DIR"))
-        yield Finding(
-            "kernel cache", "ok" if kept else "note",
-            "compiled kernels are kept" if kept else "kernels are kept in your home folder",
-        )  # fmt: skip
+    def backend(self, config: Any) -> str:
+        from stages.fit.backend import expected_backend
+
+        return expected_backend(config)
 
     def report(self) -> Parts:
         from stages.fit.report import PARTS
@@ -82,7 +80,7 @@ class FitStage(Stage):
 
         diary = context.scratch / "diary"
         diary.mkdir(parents=True, exist_ok=True)
-        context.progress("preparing (a first run compiles its kernels)", 0, 1)
+        context.progress("preparing", 0, 1)
         result = fit(
             placed, placed_cameras, points, flow, settings,
             threads=context.threads, checkpoint=context.scratch / "fit.npz", report=report,

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import kernel
 from stages.fit.checkpoint import Arrays
 from stages.fit.warp import turned
 from stages.splatting.threads import KERNELS
@@ -63,7 +64,7 @@ def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
     packed[known, 9] += np.float32(np.log(flatness))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _pull(packed: Floats, anchor: Floats, turn: Floats):  # type: ignore[no-untyped-def]
     """`HeldSurface.pull`; arrays as it has them."""
     for i in prange(len(packed)):

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 from scipy.spatial import cKDTree
 
+from pipeline.kernels import inlined, kernel
 from stages.fit.checkpoint import Arrays
-from stages.splatting.lane_types import WIDTH
-from stages.splatting.lanes import (
+from stages.splatting.lanes.types import WIDTH
+from stages.splatting.lanes.vectors import (
     at_least,
     at_most,
     count_up,
@@ -32,12 +33,12 @@ F = np.float32
 CHUNK = 256
 
 
-@njit(inline="always")
+@inlined
 def _slope(difference):  # type: ignore[no-untyped-def]
     return min(max(difference, F(-1)), F(1))
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _few_columns(  # type: ignore[no-untyped-def]
     values: Floats, first: int, last: int, neighbours: Integers, starts: Integers,
     inverse: np.float32, weight: np.float32, gradient: Floats,
@@ -58,7 +59,7 @@ def _few_columns(  # type: ignore[no-untyped-def]
                 gradient[i, k + 2] += weight * by_c
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _many_columns(  # type: ignore[no-untyped-def]
     values: Floats, first: int, last: int, neighbours: Integers, starts: Integers,
     inverse: np.float32, weight: np.float32, gradient: Floats,

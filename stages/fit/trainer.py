@@ -29,8 +29,8 @@ from stages.fit.targets import Target
 from stages.fit.total_variation import TotalVariation
 from stages.fit.warp import Warp, turned
 from stages.splatting.adam import Adam
-from stages.splatting.harmonics import C0
-from stages.splatting.projection import HARMONICS
+from stages.splatting.kernels.features import C0
+from stages.splatting.kernels.projection import HARMONICS
 from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint, rasterize
 
 Array = npt.NDArray[np.float64]

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import kernel
 from stages.fit.checkpoint import Arrays
 from stages.fit.spline_field import SplineField
 from stages.splatting.adam import Adam
@@ -145,7 +146,7 @@ class Warp:
         self.adam.steps, self.collected = (int(n) for n in arrays["warp_steps"])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _collect(  # type: ignore[no-untyped-def]
     by_position: Floats, by_normal: Floats, lit: bool, normals: Floats, gradient: Floats
 ):
@@ -162,7 +163,7 @@ def _collect(  # type: ignore[no-untyped-def]
                 gradient[i, 1 + k] -= by_normal[i, k] - along * normals[i, k]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _bend(  # type: ignore[no-untyped-def]
     displacement: Floats, slope: Floats, normals: Floats, shape: Floats, move: Floats,
     lean: Floats, facing: Floats,
@@ -187,7 +188,7 @@ def _bend(  # type: ignore[no-untyped-def]
             facing[i, k] /= length
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _turned(  # type: ignore[no-untyped-def]
     quaternions: Floats, first: Floats, second: Floats, result: Floats
 ):
@@ -220,7 +221,8 @@ def turned(quaternions: Floats, first: Floats, second: Floats) -> Floats:
     Between opposite vectors it is one of the half turns; vectors of 0 turn nothing.
     """
     result = np.empty((len(quaternions), 4), np.float32)
-    first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
+    # contiguous, all of them: one kernel instead of one for each mixture
+    given = (np.ascontiguousarray(array, np.float32) for array in (quaternions, first, second))
     with KERNELS:
-        _turned(np.asarray(quaternions, np.float32), first, second, result)
+        _turned(*given, result)
     return result

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import kernel
 
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -17,7 +17,7 @@ _SMALLEST_RADIUS = 0.71
 _LARGEST_RADIUS = 5.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _splat(pixels: Array, depths: Array, radii: Array, buffer: Array) -> None:
     """Write each point as a disc into the z-buffer `buffer` (infinite where empty)."""
     height, width = buffer.shape

@@ -97,6 +97,7 @@ class FlowStage(Stage):
     optional = ("cameras", "points")
     provides = ("flow",)
     libraries = ("opencv-contrib-python-headless", "numpy", "numba")
+    rehearsals = ("stages.flow.rehearsal:splatting",)
     methods: ClassVar[Mapping[str, str]] = {
         "dis": "Dense Inverse Search (Kroeger et al. 2016): fast, the default",
         "farneback": "polynomial expansion (Farnebäck 2003)",

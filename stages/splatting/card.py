@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from stages.splatting.projection import HARMONICS
+from stages.splatting.kernels.projection import HARMONICS
 from stages.splatting.rasterizer import Viewpoint
 from stages.splatting.reference import colours, project
 from stages.splatting.torch_api import Backend, rasterization

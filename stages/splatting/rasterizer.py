@@ -15,9 +15,15 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import SH_COEFFICIENTS, Gaussians
-from stages.splatting.gather import gather
-from stages.splatting.harmonics import features_backward, features_forward
-from stages.splatting.projection import (
+from stages.splatting.kernels.compositing import (
+    aligned_empty,
+    composite_backward,
+    composite_forward,
+    slot_columns,
+)
+from stages.splatting.kernels.features import features_backward, features_forward
+from stages.splatting.kernels.gathering import gather
+from stages.splatting.kernels.projection import (
     CAMERA_GRADIENTS,
     CHUNK,
     HARMONICS,
@@ -26,14 +32,8 @@ from stages.splatting.projection import (
     project_backward,
     project_forward,
 )
-from stages.splatting.raster import (
-    aligned_empty,
-    composite_backward,
-    composite_forward,
-    slot_columns,
-)
+from stages.splatting.kernels.tiles import TILE, count_tiles, fill_tiles, list_tiles, order_by_depth
 from stages.splatting.threads import KERNELS, use_threads, workers
-from stages.splatting.tiles import TILE, count_tiles, fill_tiles, list_tiles, order_by_depth
 
 __all__ = ["Gradients", "Rendering", "Viewpoint", "pack", "rasterize", "unpack", "use_threads"]
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+
+from pipeline.kernels import each, helper, kernel
 
 Array = npt.NDArray[np.float32]
 
@@ -17,7 +18,7 @@ _STRIP = 16
 _FAR = np.float32(1e9)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@helper(fastmath=True)
 def _step(cost, previous, previous_min, p1, p2, current, total):  # type: ignore[no-untyped-def]
     """One pixel of a path: previous and current are padded by one on both sides."""
     limit = previous_min + p2
@@ -32,8 +33,9 @@ def _step(cost, previous, previous_min, p1, p2, current, total):  # type: ignore
     return least
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _horizontal(volume, penalty, p1, y, total):  # type: ignore[no-untyped-def]
+@kernel(fastmath=True, nogil=True)
+def _horizontal(y, volume, penalty, p1, total):  # type: ignore[no-untyped-def]
+    """The paths along row y, both ways."""
     width, planes = volume.shape[1:]
     for direction in range(2):
         previous = np.zeros(planes + 2, np.float32)
@@ -47,9 +49,12 @@ def _horizontal(volume, penalty, p1, y, total):  # type: ignore[no-untyped-def]
             previous, current = current, previous
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _vertical(volume, penalty, p1, x0, x1, total):  # type: ignore[no-untyped-def]
-    height, planes = volume.shape[0], volume.shape[2]
+@kernel(fastmath=True, nogil=True)
+def _vertical(strip, volume, penalty, p1, total):  # type: ignore[no-untyped-def]
+    """The paths along a strip of columns, both ways."""
+    height, width, planes = volume.shape
+    x0 = strip * _STRIP
+    x1 = min(x0 + _STRIP, width)
     for direction in range(2):
         previous = np.zeros((x1 - x0, planes + 2), np.float32)
         current = np.zeros((x1 - x0, planes + 2), np.float32)
@@ -68,21 +73,11 @@ def _vertical(volume, penalty, p1, x0, x1, total):  # type: ignore[no-untyped-de
             previous, current = current, previous
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _aggregate(volume, penalty, p1, total):  # type: ignore[no-untyped-def]
-    height, width, _ = volume.shape
-    for y in prange(height):
-        _horizontal(volume, penalty, p1, y, total)
-    for strip in prange((width + _STRIP - 1) // _STRIP):
-        x0 = strip * _STRIP
-        x1 = min(x0 + _STRIP, width)
-        _vertical(volume, penalty, p1, x0, x1, total)
-
-
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _decide(total, volume, plane, ncc, margin):  # type: ignore[no-untyped-def]
+@kernel(fastmath=True, nogil=True)
+def _decide(band, total, volume, plane, ncc, margin):  # type: ignore[no-untyped-def]
+    """`decide` for a band of rows."""
     height, width, planes = total.shape
-    for y in prange(height):
+    for y in range(band * _BAND, min((band + 1) * _BAND, height)):
         for x in range(width):
             sums = total[y, x]
             best = 0
@@ -122,7 +117,9 @@ def edge_aware_penalty(gray: Array, p2: float, falloff: float = 20.0) -> Array:
 def aggregate(volume: Array, penalty: Array, p1: float) -> Array:
     """Sum of the path costs of a volume [H, W, D]; `penalty` [H, W] is P2 of each pixel."""
     total = np.zeros_like(volume)
-    _aggregate(volume, penalty, np.float32(p1), total)
+    height, width, _ = volume.shape
+    each(_horizontal, height, volume, penalty, np.float32(p1), total)
+    each(_vertical, -(-width // _STRIP), volume, penalty, np.float32(p1), total)
     return total
 
 
@@ -139,5 +136,5 @@ def decide(total: Array, volume: Array) -> tuple[Array, Array, Array]:
     """
     shape = total.shape[:2]
     plane, ncc, margin = (np.empty(shape, np.float32) for _ in range(3))
-    _decide(total, volume, plane, ncc, margin)
+    each(_decide, -(-shape[0] // _BAND), total, volume, plane, ncc, margin)
     return plane, ncc, margin

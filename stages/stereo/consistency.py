@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import each, helper, kernel
 
 Array = npt.NDArray[np.float32]
 
@@ -34,7 +34,7 @@ def camera_table(cameras: list[Camera]) -> npt.NDArray[np.float64]:
     return np.array(rows, np.float64)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _lift(c, x, y, z):  # type: ignore[no-untyped-def]
     """World point of pixel (x, y) at depth z."""
     a = (x + 0.5 - c[2]) / c[0] * z - c[15]
@@ -47,7 +47,7 @@ def _lift(c, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _drop(c, X, Y, Z):  # type: ignore[no-untyped-def]
     """Pixel and depth of a world point (pixel indices: centre of the first is 0, 0)."""
     a = c[6] * X + c[7] * Y + c[8] * Z + c[15]
@@ -58,63 +58,63 @@ def _drop(c, X, Y, Z):  # type: ignore[no-untyped-def]
     return c[0] * a / z + c[2] - 0.5, c[1] * b / z + c[3] - 0.5, z
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _check(  # type: ignore[no-untyped-def]
-    index, depths, weights, cameras, relative, pixels, front, agree, conflict, fused, angle
+@kernel(nogil=True)
+def _check_row(  # type: ignore[no-untyped-def]
+    y, index, depths, weights, cameras, relative, pixels, front, agree, conflict, fused, angle
 ):
+    """One row of `check`."""
     here = cameras[index]
     views = depths.shape[0]
-    for y in prange(agree.shape[0]):
-        for x in range(agree.shape[1]):
-            z = np.float64(depths[index, y, x])
-            if z <= 0:
+    for x in range(agree.shape[1]):
+        z = np.float64(depths[index, y, x])
+        if z <= 0:
+            continue
+        X, Y, Z = _lift(here, x, y, z)
+        mean = z * weights[index, y, x]
+        mass = np.float64(weights[index, y, x])
+        ox = X + here[6] * here[15] + here[9] * here[16] + here[12] * here[17]
+        oy = Y + here[7] * here[15] + here[10] * here[16] + here[13] * here[17]
+        oz = Z + here[8] * here[15] + here[11] * here[16] + here[14] * here[17]
+        length = np.sqrt(ox * ox + oy * oy + oz * oz)
+        widest = 0.0
+        for v in range(views):
+            if v == index:
                 continue
-            X, Y, Z = _lift(here, x, y, z)
-            mean = z * weights[index, y, x]
-            mass = np.float64(weights[index, y, x])
-            ox = X + here[6] * here[15] + here[9] * here[16] + here[12] * here[17]
-            oy = Y + here[7] * here[15] + here[10] * here[16] + here[13] * here[17]
-            oz = Z + here[8] * here[15] + here[11] * here[16] + here[14] * here[17]
-            length = np.sqrt(ox * ox + oy * oy + oz * oz)
-            widest = 0.0
-            for v in range(views):
-                if v == index:
-                    continue
-                there = cameras[v]
-                u, w, zv = _drop(there, X, Y, Z)
-                if zv <= 0:
-                    continue
-                j = np.int64(np.floor(u + 0.5))
-                i = np.int64(np.floor(w + 0.5))
-                if i < 0 or j < 0 or i >= there[5] or j >= there[4]:
-                    continue
-                seen = np.float64(depths[v, i, j])
-                if seen <= 0:
-                    continue
-                if zv < seen * (1 - front):
-                    conflict[y, x] += 1
-                    continue
-                if abs(seen - zv) > relative * zv:
-                    continue
-                A, B, C = _lift(there, j, i, seen)
-                back_u, back_w, _ = _drop(here, A, B, C)
-                if (back_u - x) ** 2 + (back_w - y) ** 2 > pixels * pixels:
-                    continue
-                agree[y, x] += 1
-                # Its surface moved to our ray: correct for the sub-pixel lookup to first order by
-                # taking the difference of depths at its pixel instead of its depth.
-                value = z + (seen - zv) * z / zv
-                weight = np.float64(weights[v, i, j])
-                mean += weight * value
-                mass += weight
-                px = X + there[6] * there[15] + there[9] * there[16] + there[12] * there[17]
-                py = Y + there[7] * there[15] + there[10] * there[16] + there[13] * there[17]
-                pz = Z + there[8] * there[15] + there[11] * there[16] + there[14] * there[17]
-                norm = np.sqrt(px * px + py * py + pz * pz)
-                cosine = (ox * px + oy * py + oz * pz) / max(length * norm, 1e-12)
-                widest = max(widest, np.arccos(min(max(cosine, -1.0), 1.0)))
-            fused[y, x] = np.float32(mean / max(mass, 1e-12))
-            angle[y, x] = np.float32(widest)
+            there = cameras[v]
+            u, w, zv = _drop(there, X, Y, Z)
+            if zv <= 0:
+                continue
+            j = np.int64(np.floor(u + 0.5))
+            i = np.int64(np.floor(w + 0.5))
+            if i < 0 or j < 0 or i >= there[5] or j >= there[4]:
+                continue
+            seen = np.float64(depths[v, i, j])
+            if seen <= 0:
+                continue
+            if zv < seen * (1 - front):
+                conflict[y, x] += 1
+                continue
+            if abs(seen - zv) > relative * zv:
+                continue
+            A, B, C = _lift(there, j, i, seen)
+            back_u, back_w, _ = _drop(here, A, B, C)
+            if (back_u - x) ** 2 + (back_w - y) ** 2 > pixels * pixels:
+                continue
+            agree[y, x] += 1
+            # Its surface moved to our ray: correct for the sub-pixel lookup to first order by
+            # taking the difference of depths at its pixel instead of its depth.
+            value = z + (seen - zv) * z / zv
+            weight = np.float64(weights[v, i, j])
+            mean += weight * value
+            mass += weight
+            px = X + there[6] * there[15] + there[9] * there[16] + there[12] * there[17]
+            py = Y + there[7] * there[15] + there[10] * there[16] + there[13] * there[17]
+            pz = Z + there[8] * there[15] + there[11] * there[16] + there[14] * there[17]
+            norm = np.sqrt(px * px + py * py + pz * pz)
+            cosine = (ox * px + oy * py + oz * pz) / max(length * norm, 1e-12)
+            widest = max(widest, np.arccos(min(max(cosine, -1.0), 1.0)))
+        fused[y, x] = np.float32(mean / max(mass, 1e-12))
+        angle[y, x] = np.float32(widest)
 
 
 def check(
@@ -147,8 +147,8 @@ def check(
     conflict = np.zeros(shape, np.int32)
     fused = np.zeros(shape, np.float32)
     angle = np.zeros(shape, np.float32)
-    _check(
-        int(index), depths, weights, cameras, float(relative), float(pixels), float(front),
-        agree, conflict, fused, angle,
+    each(
+        _check_row, shape[0], int(index), depths, weights, cameras, float(relative),
+        float(pixels), float(front), agree, conflict, fused, angle,
     )  # fmt: skip
     return agree, conflict, fused, angle

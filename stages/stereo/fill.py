@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 from scipy import ndimage
+
+from pipeline.kernels import kernel
 
 Array = npt.NDArray[np.float32]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def _relax(value, data, weight, right, down, pull, far, sweeps):  # type: ignore[no-untyped-def]
     """Red-black Gauss-Seidel on the screened membrane energy of `complete`."""
     height, width = value.shape

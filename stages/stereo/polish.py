@@ -11,9 +11,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import helper, kernel
 
 Array = npt.NDArray[np.float32]
 F = np.float32
@@ -86,7 +87,7 @@ def _slopes(inverse: Array, known: npt.NDArray[np.bool_]) -> tuple[Array, Array]
     return slopes[0], slopes[1]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _correlation(  # type: ignore[no-untyped-def]
     gray, use, stack, sizes, maps, x, y, w, slope_x, slope_y, radius
 ):
@@ -144,7 +145,7 @@ def _correlation(  # type: ignore[no-untyped-def]
     return total / F(half)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _noise(x, y, number, which):  # type: ignore[no-untyped-def]
     """A number in -1..1 that depends on its arguments alone (splitmix64)."""
     z = np.uint64(x * 73856093 + y * 19349663 + number * 83492791 + which * 2654435761)
@@ -154,7 +155,7 @@ def _noise(x, y, number, which):  # type: ignore[no-untyped-def]
     return F(2) * F(z >> np.uint64(40)) / F(1 << 24) - F(1)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def _half_pass(  # type: ignore[no-untyped-def]
     gray, use, stack, sizes, maps, planes, best, steps, colour, radius, step, number
 ):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.consistency import camera_table, check, stack_depths
@@ -70,13 +70,8 @@ def dense_depths(
             )
     if options.method not in METHODS:
         raise ValueError(f"unknown dense method '{options.method}'; there are {METHODS}")
-    before = numba.get_num_threads()
-    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    numba.set_num_threads(max(1, min(threads, available)))
-    try:
+    with kernel_threads(threads):
         return _dense_depths(images, valid, cameras, sparse, options, progress)
-    finally:
-        numba.set_num_threads(before)
 
 
 def complete_depths(
@@ -95,14 +90,9 @@ def complete_depths(
         depths: V arrays [H, W] float32 z-depth, 0 where unknown.
         confidences: V arrays [H, W] float32 >= 1 of it.
     """
-    before = numba.get_num_threads()
-    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    numba.set_num_threads(max(1, min(threads, available)))
-    try:
+    with kernel_threads(threads):
         grays = [to_gray(image) for image in images]
         return _finish(depths, confidences, grays, valid, cameras, options)
-    finally:
-        numba.set_num_threads(before)
 
 
 def _dense_depths(

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import each, helper, kernel
 
 Array = npt.NDArray[np.float32]
 
@@ -68,7 +68,7 @@ def stack_sources(images: list[Array], usable: list[npt.NDArray[np.bool_]]) -> t
     return stack, np.array([image.shape for image in images], np.float32)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@helper(fastmath=True)
 def _warp_row(source, height, width, h, y, x0, row):  # type: ignore[no-untyped-def]
     """Sample a source [H, W] bilinearly along reference row y, columns x0, x0 + 1, ..."""
     v0 = h[1] * y + h[2]
@@ -96,12 +96,14 @@ def _warp_row(source, height, width, h, y, x0, row):  # type: ignore[no-untyped-
         row[k] = top * (one - a) + low * a if inside else UNUSABLE
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, nogil=True)
 def _sweep_band(  # type: ignore[no-untyped-def]
-    y0, y1, reference, weight, sources, sizes, homographies, radius, var_min, keep, volume
+    band, reference, weight, sources, sizes, homographies, radius, var_min, keep, volume
 ):
-    """Fill rows y0..y1 of the cost volume."""
+    """Fill a band of rows of the cost volume."""
     height, width = reference.shape
+    y0 = band * _BAND
+    y1 = min(y0 + _BAND, height)
     planes = homographies.shape[0]
     count = sources.shape[0]
     window = 2 * radius + 1
@@ -196,19 +198,6 @@ def _sweep_band(  # type: ignore[no-untyped-def]
                 volume[y0 + r, x, d] = mean / np.float32(use)
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def _sweep(  # type: ignore[no-untyped-def]
-    reference, weight, sources, sizes, homographies, radius, var_min, keep, volume
-):
-    height = reference.shape[0]
-    for band in prange((height + _BAND - 1) // _BAND):
-        y0 = band * _BAND
-        y1 = min(y0 + _BAND, height)
-        _sweep_band(
-            y0, y1, reference, weight, sources, sizes, homographies, radius, var_min, keep, volume
-        )
-
-
 def cost_volume(
     reference: Array,
     usable: npt.NDArray[np.bool_],
@@ -239,8 +228,9 @@ def cost_volume(
     """
     height, width = reference.shape
     volume = np.empty((height, width, len(homographies)), np.float32)
-    _sweep(
-        np.ascontiguousarray(reference, np.float32), usable.astype(np.float32),
-        sources, sizes, homographies, int(window) // 2, np.float32(var_min), int(keep), volume,
+    each(
+        _sweep_band, -(-height // _BAND), np.ascontiguousarray(reference, np.float32),
+        usable.astype(np.float32), sources, sizes, homographies, int(window) // 2,
+        np.float32(var_min), int(keep), volume,
     )  # fmt: skip
     return volume

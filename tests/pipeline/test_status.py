@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import pipeline
+from pipeline.planning import key_material
+from pipeline.stage import get_stage
 
 
 def states(toys: Path, *overrides: str) -> dict[str, tuple[str, list[str]]]:
@@ -42,6 +45,19 @@ def test_names_library_seed_and_version(
     (reason,) = states(toys)["scale"][1]
     assert reason.startswith("library numpy") and reason.endswith("→ 0.0.1")
     monkeypatch.undo()
+
+
+def test_names_what_auto_comes_to(run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run()
+    monkeypatch.setattr(type(get_stage("scale")), "backend", lambda self, config: "card")
+    assert states(toys)["scale"] == ("stale", ["scale backend (unknown) → card"])
+
+
+def test_llvmlite_counts_where_numba_does(toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = get_stage("read")
+    monkeypatch.setattr(type(stage), "libraries", ("numba",))
+    config = SimpleNamespace(sections={"read": stage.Config()}, run=SimpleNamespace(seed=0))
+    assert key_material(stage, config, {}, {})["libraries"].keys() == {"numba", "llvmlite"}
 
 
 def test_stages_never_run_are_missing(run: Any, toys: Path) -> None:

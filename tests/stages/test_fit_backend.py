@@ -98,3 +98,15 @@ def test_a_card_that_is_not_there_is_explained(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(backend, "has_card", lambda: True)
     with pytest.raises(RequestError, match="focal"):
         fitted(tmp_path, backend="gsplat", optimize_focal=True)
+
+
+def test_the_key_says_what_a_fit_runs_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = FitStage()
+    monkeypatch.setattr(backend, "has_card", lambda: False)
+    assert stage.backend(stage.Config()) == "cpu"
+    monkeypatch.setattr(backend, "has_card", lambda: True)
+    monkeypatch.setattr(backend, "version", lambda name: "1.0")
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Card 9")
+    assert stage.backend(stage.Config()) == "Card 9, gsplat 1.0, torch 1.0"
+    assert stage.backend(stage.Config(backend="cpu")) == "cpu"
+    assert stage.backend(stage.Config(optimize_focal=True)) == "cpu"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.splatting.blocks import BLOCK, BLOCKS, SIDE, TILE, touched_blocks
-from stages.splatting.lanes import exponential, load_from, log2, store_from
+from stages.splatting.lanes.blocks import BLOCK, BLOCKS, SIDE, TILE, touched_blocks
+from stages.splatting.lanes.vectors import exponential, load_from, log2, store_from
 
 LANES = 16
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from pipeline.kernels import kernel
 
 
-@njit(
+@kernel(
     "void(float64[::1], float64[:,::1], float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def rotation_and_jacobian(w, rotation, jacobian):  # type: ignore[no-untyped-def]
@@ -44,7 +43,7 @@ def rotation_and_jacobian(w, rotation, jacobian):  # type: ignore[no-untyped-def
     jacobian[2, 1] += c * x
 
 
-@njit("void(float64[::1], float64[:,::1])", cache=True, error_model="numpy", nogil=True)
+@kernel("void(float64[::1], float64[:,::1])", nogil=True)
 def cross_matrix(t, out):  # type: ignore[no-untyped-def]
     """[t]x: cross_matrix @ v = t x v."""
     out[0, 0] = out[1, 1] = out[2, 2] = 0.0
@@ -52,7 +51,7 @@ def cross_matrix(t, out):  # type: ignore[no-untyped-def]
     out[1, 0], out[2, 0], out[2, 1] = t[2], -t[1], t[0]
 
 
-@njit("float64(float64[:,::1], float64[:,::1])", cache=True, error_model="numpy", nogil=True)
+@kernel("float64(float64[:,::1], float64[:,::1])", nogil=True)
 def cholesky(A, L):  # type: ignore[no-untyped-def]
     """Lower factor of A into L; returns log det A, or nan where A is not positive definite."""
     n = len(A)
@@ -72,9 +71,7 @@ def cholesky(A, L):  # type: ignore[no-untyped-def]
     return log_determinant
 
 
-@njit(
-    "void(float64[:,::1], float64[::1], float64[::1])", cache=True, error_model="numpy", nogil=True
-)
+@kernel("void(float64[:,::1], float64[::1], float64[::1])", nogil=True)
 def solve_cholesky(L, b, out):  # type: ignore[no-untyped-def]
     """Solve L Lt out = b."""
     n = len(b)
@@ -90,11 +87,9 @@ def solve_cholesky(L, b, out):  # type: ignore[no-untyped-def]
         out[i] = total / L[i, i]
 
 
-@njit(
+@kernel(
     "float64(float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1],"
     " float64, float64[:,::1], float64[::1], float64[:,:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def eliminate(H, b, H_own, b_own, H_cross, damping, S, s, own_inverse):  # type: ignore[no-untyped-def]

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from pipeline.geometry.rigid import nearest_rotation
+from pipeline.kernels import kernel
 from stages.init.dental.cameras.algebra import (
     cholesky,
     eliminate,
@@ -98,11 +98,9 @@ def nearest_similarity(
     return np.ascontiguousarray(rotation), centre, float(np.log(scale))
 
 
-@njit(
+@kernel(
     "void(float64[:,::1], float64[::1], float64, float64[:,:,::1], float64[:,::1],"
     " float64[:,:,::1], float64[:,::1], float64, float64[::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def unknowns_of(  # type: ignore[no-untyped-def]
@@ -126,11 +124,9 @@ def unknowns_of(  # type: ignore[no-untyped-def]
         x[PER_VIEW * v + 6] = 0.0
 
 
-@njit(
+@kernel(
     "void(float64, float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
     " float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
@@ -150,13 +146,11 @@ def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type
         T[PER_VIEW * views + k, PER_SIMILARITY + k] = 1
 
 
-@njit(
+@kernel(
     "UniTuple(float64, 2)(float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64,"
     " float64[:,:,::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1], float64[:,::1],"
     " float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1], float64, float64,"
     " float64[::1], float64[::1], int64, float64, float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def minimise_held(  # type: ignore[no-untyped-def]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.kernels import kernel
 from stages.init.dental.cameras.algebra import (
     cholesky,
     cross_matrix,
@@ -26,11 +26,9 @@ LANDMARK_KNEE, DENSE_KNEE = 2.0, 1.5
 CENTRE_Z = -16.0
 
 
-@njit(
+@kernel(
     "void(float64[::1], int64, float64[:,:,::1], float64[:,::1], float64, float64[::1],"
     " float64[::1], float64[:,:,::1], float64[:,::1], float64[::1], float64[:,:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def place_cameras(  # type: ignore[no-untyped-def]
@@ -56,13 +54,11 @@ def place_cameras(  # type: ignore[no-untyped-def]
         lens[v] = focals[v] * np.exp(p[6] * focal_deviations[v])
 
 
-@njit(
+@kernel(
     "float64(float64[::1], float64[:,::1], int64, int64[::1], int64[::1], float64[:,::1],"
     " float64[:,::1], float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1],"
     " float64[::1], float64[:,:,::1], float64[:,::1], float64[::1], boolean,"
     " float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def add_landmarks(  # type: ignore[no-untyped-def]
@@ -144,12 +140,10 @@ def add_landmarks(  # type: ignore[no-untyped-def]
     return cost
 
 
-@njit(
+@kernel(
     "float64(int64[:,::1], int64[::1], float64[:,::1], float64[::1], float64[::1],"
     " float64[:,:,::1], float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1],"
     " float64[::1], boolean, float64[:,::1], float64[::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def add_matches(  # type: ignore[no-untyped-def]
@@ -222,9 +216,7 @@ def add_matches(  # type: ignore[no-untyped-def]
                         unit[a] = jacobians[v, a, k] * angle_deviations[v, k]
                     cross_matrix(unit, spin)
                     dR = spin @ R if side else -(R @ spin)
-                    dt = np.zeros(3) if side else -(dR @ np.ascontiguousarray(centres[i]))
-                    if side:
-                        dt = -(dR @ np.ascontiguousarray(centres[i]))
+                    dt = -(dR @ np.ascontiguousarray(centres[i]))
                     cross_matrix(dt, d_t_cross)
                     dE = d_t_cross @ R + t_cross @ dR
                 elif k < 6:
@@ -253,11 +245,9 @@ def add_matches(  # type: ignore[no-untyped-def]
     return cost
 
 
-@njit(
+@kernel(
     "float64(float64[::1], float64[:,::1], int64, float64, float64, float64[:,::1], boolean,"
     " float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def add_priors(  # type: ignore[no-untyped-def]
@@ -294,13 +284,11 @@ def add_priors(  # type: ignore[no-untyped-def]
     return cost
 
 
-@njit(
+@kernel(
     "UniTuple(float64, 2)(float64[::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1],"
     " float64[:,::1], float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1],"
     " float64, float64, float64[::1], float64[::1], int64[:,::1], int64[::1], float64[:,::1],"
     " float64[::1], float64[::1], int64, float64, float64[:,::1])",
-    cache=True,
-    error_model="numpy",
     nogil=True,
 )
 def minimise(  # type: ignore[no-untyped-def]

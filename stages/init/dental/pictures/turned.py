@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.kernels import kernel
 from stages.init.dental.surface.dense import ArchSurface
 
 Array32 = npt.NDArray[np.float32]
@@ -18,7 +18,7 @@ _DISTANCE = 160.0
 _OVERSAMPLING = 2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(nogil=True)
 def _paint(pixels, depths, colours, faces, depth, image):  # type: ignore[no-untyped-def]
     height, width = depth.shape
     for f in range(faces.shape[0]):

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import kernel
 from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
@@ -42,7 +43,7 @@ def in_void(points: Array32, normals: Array32, offsets: Array32, photos: list[Ph
     return found
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def _mark(points, normals, offsets, void, c, found):  # type: ignore[no-untyped-def]
     rows, cols = points.shape[:2]
     height, width = void.shape
@@ -61,7 +62,7 @@ def _mark(points, normals, offsets, void, c, found):  # type: ignore[no-untyped-
                     found[i, j, d] = True
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def _nearest_outside(void, plane, target):  # type: ignore[no-untyped-def]
     """The nearest plane outside the void into `target` [H, W]; -1 where all planes are inside."""
     rows, cols, count = void.shape

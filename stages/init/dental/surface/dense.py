@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
+from pipeline.kernels import kernel_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.charts import (
     PAST_EDGE,
@@ -113,14 +113,8 @@ def dense_surface(
             f"dense_surface needs one image, mask, dentition and camera per photograph, not "
             f"{len(images)}, {len(valid)}, {len(dentitions)} and {len(fit.views)}"
         )
-    before = numba.get_num_threads()
-    available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-    numba.set_num_threads(max(1, min(threads, available)))
-    try:
-        with threadpool_limits(limits=1, user_api="blas"):
-            return _dense_surface(images, valid, dentitions, fit, options, threads, progress)
-    finally:
-        numba.set_num_threads(before)
+    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
+        return _dense_surface(images, valid, dentitions, fit, options, threads, progress)
 
 
 def _dense_surface(

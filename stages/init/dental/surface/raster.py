@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.kernels import kernel
 from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(nogil=True)
 def _triangle(ax, ay, az, bx, by, bz, cx, cy, cz, corners, depth, place):  # type: ignore[no-untyped-def]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     # Clockwise in the image, where y runs down, is counter-clockwise from outside; the rest is seen
@@ -40,7 +40,7 @@ def _triangle(ax, ay, az, bx, by, bz, cx, cy, cz, corners, depth, place):  # typ
                 place[y, x, 1] = u * corners[1] + v * corners[3] + w * corners[5]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(nogil=True)
 def _raster(pixels, depths, used, depth, place):  # type: ignore[no-untyped-def]
     rows, cols = used.shape
     corners = np.zeros(6)

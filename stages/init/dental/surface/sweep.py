@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from pipeline.kernels import helper, kernel
 from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
@@ -71,7 +72,7 @@ class Matches:
     weight: Array32
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@helper(fastmath=True)
 def _bilinear(image, height, width, x, y):  # type: ignore[no-untyped-def]
     x = min(max(x - np.float32(0.5), np.float32(0)), np.float32(width - 1.001))
     y = min(max(y - np.float32(0.5), np.float32(0)), np.float32(height - 1.001))
@@ -82,7 +83,7 @@ def _bilinear(image, height, width, x, y):  # type: ignore[no-untyped-def]
     return top + fy * (low - top)
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@helper(fastmath=True)
 def _box(values, radius, sums, out):  # type: ignore[no-untyped-def]
     """Mean over a (2 radius + 1)^2 window, cut at the borders."""
     rows, cols = values.shape
@@ -113,7 +114,7 @@ def _box(values, radius, sums, out):  # type: ignore[no-untyped-def]
             out[i, j] = column[j] * scale
 
 
-@njit(cache=True, parallel=True, error_model="numpy", fastmath=True)
+@kernel(parallel=True, fastmath=True)
 def _volume(  # type: ignore[no-untyped-def]
     points, normals, offsets, textures, sizes, cameras, pairs, seen, radius, neutral, floor, volume
 ):

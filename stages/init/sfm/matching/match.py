@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from itertools import combinations
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels import kernel
 from stages.init.sfm.matching.features import Features
 
 Pair = tuple[int, int]
@@ -63,8 +63,8 @@ def match_features(
         similarity[rows] = np.take_along_axis(block, best_b[rows, None].astype(np.int64), 1)[:, 0]
         _update_columns(block, start, best_a, best_a_similarity)
         _stand_alone(
-            block, best_b[rows], norms_a[rows], norms_b, place_b, ratio, distinct_radius,
-            alone[rows],
+            block, best_b[rows], norms_a[rows], norms_b, place_b, float(ratio),
+            float(distinct_radius), alone[rows],
         )  # fmt: skip
 
     back = place_a[best_a[best_b]]
@@ -121,9 +121,7 @@ def select_pairs(counts: dict[Pair, int], view_count: int, best: int) -> list[Pa
     return sorted(kept)
 
 
-@numba.njit(
-    "void(float32[:, ::1], int64, int32[::1], float32[::1])", cache=True, error_model="numpy"
-)
+@kernel()
 def _update_columns(block, start, best_row, best_value):  # type: ignore[no-untyped-def]
     """Fold a block [R, C] of rows from `start` on into each column's best row so far."""
     for row in range(block.shape[0]):
@@ -134,12 +132,7 @@ def _update_columns(block, start, best_row, best_value):  # type: ignore[no-unty
             best_row[column] = np.int32(start + row) if better else best_row[column]
 
 
-@numba.njit(
-    "void(float32[:, ::1], int32[::1], float32[::1], float32[::1], float32[:, ::1], float64, "
-    "float64, boolean[::1])",
-    cache=True,
-    error_model="numpy",
-)
+@kernel()
 def _stand_alone(  # type: ignore[no-untyped-def]
     block, best, row_norms, column_norms, places, ratio, radius, result
 ):

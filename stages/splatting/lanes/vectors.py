@@ -1,15 +1,12 @@
 """Sixteen numbers at a time inside a numba kernel: LLVM vectors as numba types.
 
 LLVM's own vectoriser gives up on a loop for small reasons, at five times the cost, and keeps sums
-in memory that fit into registers. With these types a kernel says itself what a vector is. A row of
-a tile is one `Lanes`: one register with AVX-512, two with AVX2, four with NEON.
+in memory that fit into registers. With these types a kernel says itself what a vector is: one
+`Lanes` is one register with AVX-512, two with AVX2, four with NEON.
 
     a = load(row, 0)                 # Lanes from a float32 array [..., 16], last axis contiguous
     b = where(a > 0, a * 2, a)       # operators with Lanes and with scalars
     store(row, 0, a + b)
-
-numba's cache looks at the time stamp of a kernel's own file alone: after a change here, touch the
-files of the kernels.
 """
 
 from __future__ import annotations
@@ -18,11 +15,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
 
-from stages.splatting.lane_types import (
+from pipeline.kernels import inlined
+from stages.splatting.lanes.types import (
     FLOAT,
     FLOATS,
     INT,
@@ -86,13 +84,13 @@ def store_from(typing_context, array, index, value):  # type: ignore[no-untyped-
     return types.void(array, types.intp, kind), generate
 
 
-@njit(inline="always")
+@inlined
 def load(array, row):  # type: ignore[no-untyped-def]
     """Vector number `row` of a contiguous array that is seen as [n, 16]; no bounds check."""
     return load_from(array, row * WIDTH)
 
 
-@njit(inline="always")
+@inlined
 def store(array, row, value):  # type: ignore[no-untyped-def]
     """Put a vector where `load` would read it."""
     store_from(array, row * WIDTH, value)
@@ -318,7 +316,7 @@ def sums(typing_context, vectors):  # type: ignore[no-untyped-def]
     return lanes(vectors), generate
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def exponential(x):  # type: ignore[no-untyped-def]
     """e^x, relative error below 5e-6 (5e-7 for |x| < 10), held between 1e-38 and 1e38.
 
@@ -346,7 +344,7 @@ def power_of(typing_context, value):  # type: ignore[no-untyped-def]
     return int_lanes(lanes), generate
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def log2(x):  # type: ignore[no-untyped-def]
     """Logarithm to base 2 of positive numbers, to float32's precision."""
     power = power_of(x)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 
-from stages.splatting.lane_types import BIT, INT, INTS, WIDTH, as_lanes, int_lanes, lanes
-from stages.splatting.lanes import (
+from pipeline.kernels import helper, inlined
+from stages.splatting.lanes.types import BIT, INT, INTS, WIDTH, as_lanes, int_lanes, lanes
+from stages.splatting.lanes.vectors import (
     address_of,
     at_least,
     at_most,
@@ -154,7 +155,7 @@ def store_square(typing_context, array, index, stride, value):  # type: ignore[n
     return types.void(array, types.intp, types.intp, kind), generate
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def exp2(x, lowest, p0, p1, p2, p3, p4):  # type: ignore[no-untyped-def]
     """2^x for x <= 0, relative error 3e-6: minimax polynomial on (-1, 0] times a power of two.
 
@@ -166,7 +167,7 @@ def exp2(x, lowest, p0, p1, p2, p3, p4):  # type: ignore[no-untyped-def]
     return scale_by_power(p0 + part * (p1 + part * (p2 + part * (p3 + part * p4))), whole)
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def exp2_constants():  # type: ignore[no-untyped-def]
     return (
         constant(F(-126.0)), constant(F(0.99999741)), constant(F(0.69303020)),
@@ -174,7 +175,7 @@ def exp2_constants():  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def pixels():  # type: ignore[no-untyped-def]
     """Column and row, in its block, of the pixel of each lane."""
     lane = count_up()
@@ -182,7 +183,7 @@ def pixels():  # type: ignore[no-untyped-def]
     return lane - row * F(4), row
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def touched_blocks(mx, my, e, slope, width, height, across, inverse_a):  # type: ignore[no-untyped-def]
     """The blocks of a tile that an ellipse touches, a bit each.
 
@@ -210,7 +211,7 @@ def touched_blocks(mx, my, e, slope, width, height, across, inverse_a):  # type:
     return ranges_to_bits(where(touched, counts, 0))
 
 
-@njit(error_model="numpy")
+@helper
 def workspace(vectors):  # type: ignore[no-untyped-def]
     """Zeros [vectors, 16] that begin at a cache line: a vector across two lines costs double."""
     raw = np.zeros((vectors + 1) * LANES, np.float32)
@@ -218,7 +219,7 @@ def workspace(vectors):  # type: ignore[no-untyped-def]
     return raw[start : start + vectors * LANES].reshape(vectors, LANES)
 
 
-@njit(error_model="numpy")
+@helper
 def read_tile(array, channel, x0, y0, state, first):  # type: ignore[no-untyped-def]
     """A tile of [C, H, W] as vectors of `state` from `first` on; 0 outside of the image."""
     height, width = array.shape[1], array.shape[2]
@@ -234,7 +235,7 @@ def read_tile(array, channel, x0, y0, state, first):  # type: ignore[no-untyped-
             state[first + block, lane] = array[channel, v, u] if inside else 0
 
 
-@njit(error_model="numpy")
+@helper
 def write_tile(state, first, x0, y0, array, channel):  # type: ignore[no-untyped-def]
     """The opposite of `read_tile`."""
     height, width = array.shape[1], array.shape[2]

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
-from stages.splatting import blocks
+from pipeline.kernels import helper, kernel
+from stages.splatting.lanes import blocks
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -21,7 +22,7 @@ _DIGIT_BITS = 11
 
 
 # No fastmath here: `count_tiles` and `list_tiles` must come to the same answer.
-@njit(error_model="numpy")
+@helper
 def _touches(dx0, dx1, dy0, dy1, a, b, c, reach):  # type: ignore[no-untyped-def]
     """Does the ellipse a x^2 + 2 b x y + c y^2 <= reach meet a rectangle (relative to its centre)?
 
@@ -44,7 +45,52 @@ def _touches(dx0, dx1, dy0, dy1, a, b, c, reach):  # type: ignore[no-untyped-def
     return False
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@helper
+def _count_chunk(chunk, screen, tiles_x, tiles_y, alpha_cut, bounds, count):  # type: ignore[no-untyped-def]
+    """One chunk of `count_tiles`."""
+    number = screen.shape[0]
+    for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+        count[i] = 0
+        if screen[i, 6] < F(0):
+            continue
+        u, v, half_width, half_height = screen[i, 0], screen[i, 1], screen[i, 6], screen[i, 7]
+        # pixel centres within the ellipse's box; clipped first, so that no cast overflows
+        last_x, last_y = F(tiles_x * TILE - 1), F(tiles_y * TILE - 1)
+        left = min(last_x, max(F(0), u - half_width - F(0.5)))
+        top = min(last_y, max(F(0), v - half_height - F(0.5)))
+        right = min(last_x, u + half_width - F(0.5))
+        bottom = min(last_y, v + half_height - F(0.5))
+        # rounded by casts: math.ceil and math.floor are calls
+        x0, y0 = int(left), int(top)
+        x0 += F(x0) < left
+        y0 += F(y0) < top
+        if right < F(x0) or bottom < F(y0):
+            screen[i, 6] = F(-1)
+            continue
+        from_x, to_x = x0 // TILE, int(right) // TILE + 1
+        from_y, to_y = y0 // TILE, int(bottom) // TILE + 1
+        bounds[i, 0] = from_x
+        bounds[i, 1] = to_x
+        bounds[i, 2] = from_y
+        bounds[i, 3] = to_y
+        if to_x - from_x == 1 or to_y - from_y == 1:
+            count[i] = (to_x - from_x) * (to_y - from_y)
+            continue
+        a, b, c = screen[i, 2], screen[i, 3], screen[i, 4]
+        reach = F(2) * math.log(screen[i, 5] / alpha_cut)
+        touched = 0
+        for ty in range(from_y, to_y):
+            dy = F(ty * TILE) + F(0.5) - v
+            for tx in range(from_x, to_x):
+                dx = F(tx * TILE) + F(0.5) - u
+                if _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach):
+                    touched += 1
+        count[i] = touched
+        if touched == 0:
+            screen[i, 6] = F(-1)
+
+
+@kernel(parallel=True)
 def count_tiles(  # type: ignore[no-untyped-def]
     screen: Floats, tiles_x: int, tiles_y: int, alpha_cut: np.float32, bounds: Ints, count: Ints
 ):
@@ -54,48 +100,10 @@ def count_tiles(  # type: ignore[no-untyped-def]
     """
     number = screen.shape[0]
     for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            count[i] = 0
-            if screen[i, 6] < F(0):
-                continue
-            u, v, half_width, half_height = screen[i, 0], screen[i, 1], screen[i, 6], screen[i, 7]
-            # pixel centres within the ellipse's box; clipped first, so that no cast overflows
-            last_x, last_y = F(tiles_x * TILE - 1), F(tiles_y * TILE - 1)
-            left = min(last_x, max(F(0), u - half_width - F(0.5)))
-            top = min(last_y, max(F(0), v - half_height - F(0.5)))
-            right = min(last_x, u + half_width - F(0.5))
-            bottom = min(last_y, v + half_height - F(0.5))
-            # rounded by casts: math.ceil and math.floor are calls
-            x0, y0 = int(left), int(top)
-            x0 += F(x0) < left
-            y0 += F(y0) < top
-            if right < F(x0) or bottom < F(y0):
-                screen[i, 6] = F(-1)
-                continue
-            from_x, to_x = x0 // TILE, int(right) // TILE + 1
-            from_y, to_y = y0 // TILE, int(bottom) // TILE + 1
-            bounds[i, 0] = from_x
-            bounds[i, 1] = to_x
-            bounds[i, 2] = from_y
-            bounds[i, 3] = to_y
-            if to_x - from_x == 1 or to_y - from_y == 1:
-                count[i] = (to_x - from_x) * (to_y - from_y)
-                continue
-            a, b, c = screen[i, 2], screen[i, 3], screen[i, 4]
-            reach = F(2) * math.log(screen[i, 5] / alpha_cut)
-            touched = 0
-            for ty in range(from_y, to_y):
-                dy = F(ty * TILE) + F(0.5) - v
-                for tx in range(from_x, to_x):
-                    dx = F(tx * TILE) + F(0.5) - u
-                    if _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach):
-                        touched += 1
-            count[i] = touched
-            if touched == 0:
-                screen[i, 6] = F(-1)
+        _count_chunk(np.int64(chunk), screen, tiles_x, tiles_y, alpha_cut, bounds, count)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def order_by_depth(depth_bits, count):  # type: ignore[no-untyped-def]
     """Indices of the Gaussians that touch a tile, nearest first; equal depths keep their order.
 
@@ -135,7 +143,29 @@ def order_by_depth(depth_bits, count):  # type: ignore[no-untyped-def]
     return order
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@helper
+def _list_chunk(chunk, screen, bounds, first_slot, tiles_x, alpha_cut, tile_of_slot):  # type: ignore[no-untyped-def]
+    """One chunk of `list_tiles`."""
+    number = bounds.shape[0]
+    for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+        slot, after = first_slot[i], first_slot[i + 1]
+        if slot == after:
+            continue
+        whole = (bounds[i, 1] - bounds[i, 0]) * (bounds[i, 3] - bounds[i, 2]) == after - slot
+        u, v, a, b, c = screen[i, 0], screen[i, 1], screen[i, 2], screen[i, 3], screen[i, 4]
+        reach = F(2) * math.log(screen[i, 5] / alpha_cut) if not whole else F(0)
+        for ty in range(bounds[i, 2], bounds[i, 3]):
+            dy = F(ty * TILE) + F(0.5) - v
+            for tx in range(bounds[i, 0], bounds[i, 1]):
+                dx = F(tx * TILE) + F(0.5) - u
+                if slot < after and (
+                    whole or _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach)
+                ):
+                    tile_of_slot[slot] = ty * tiles_x + tx
+                    slot += 1
+
+
+@kernel(parallel=True)
 def list_tiles(  # type: ignore[no-untyped-def]
     screen: Floats, bounds: Ints, first_slot: Ints, tiles_x: int, alpha_cut: np.float32,
     tile_of_slot: Ints,
@@ -148,26 +178,10 @@ def list_tiles(  # type: ignore[no-untyped-def]
     """
     number = bounds.shape[0]
     for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            slot, after = first_slot[i], first_slot[i + 1]
-            if slot == after:
-                continue
-            whole = (bounds[i, 1] - bounds[i, 0]) * (bounds[i, 3] - bounds[i, 2]) == after - slot
-            u, v, a, b, c = screen[i, 0], screen[i, 1], screen[i, 2], screen[i, 3], screen[i, 4]
-            reach = F(2) * math.log(screen[i, 5] / alpha_cut) if not whole else F(0)
-            for ty in range(bounds[i, 2], bounds[i, 3]):
-                dy = F(ty * TILE) + F(0.5) - v
-                for tx in range(bounds[i, 0], bounds[i, 1]):
-                    dx = F(tx * TILE) + F(0.5) - u
-                    if slot < after and (
-                        whole
-                        or _touches(dx, dx + F(TILE - 1), dy, dy + F(TILE - 1), a, b, c, reach)
-                    ):
-                        tile_of_slot[slot] = ty * tiles_x + tx
-                        slot += 1
+        _list_chunk(np.int64(chunk), screen, bounds, first_slot, tiles_x, alpha_cut, tile_of_slot)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def fill_tiles(order, first_slot, tile_of_slot, tiles):  # type: ignore[no-untyped-def]
     """List the Gaussians of every tile, nearest first.
 

@@ -1,7 +1,4 @@
-"""More of what `lanes` has, for rows of an image: parts of vectors at its edges, and windows.
-
-As with `lanes`: after a change here, touch the files of the kernels.
-"""
+"""More of what `lanes` has, for rows of an image: parts of vectors at its edges, and windows."""
 
 from __future__ import annotations
 
@@ -11,8 +8,8 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from stages.splatting.lane_types import FLOATS, INT, INTS, WIDTH, lanes, spread_value
-from stages.splatting.lanes import address_of, intrinsic, vector_of
+from stages.splatting.lanes.types import FLOATS, INT, INTS, WIDTH, lanes, spread_value
+from stages.splatting.lanes.vectors import address_of, intrinsic, vector_of
 
 
 def _lanes_between(context: Any, builder: Any, low: Any, high: Any) -> Any:

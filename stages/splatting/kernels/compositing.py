@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
-from stages.splatting.blocks import (
+from pipeline.kernels import helper, kernel
+from stages.splatting.lanes.blocks import (
     BLOCK,
     BLOCK_X,
     BLOCK_Y,
@@ -36,7 +37,7 @@ from stages.splatting.blocks import (
     workspace,
     write_tile,
 )
-from stages.splatting.lanes import (
+from stages.splatting.lanes.vectors import (
     absolute,
     any_of,
     at_most,
@@ -70,7 +71,7 @@ AHEAD = 6
 SCREEN_COLUMNS = 16
 
 
-@njit(error_model="numpy")
+@helper
 def _forward_tile(  # type: ignore[no-untyped-def]
     tile, tiles_x, offsets, members, screen, features, alpha_cut, mask, image, transmittance, stop,
     blocks, state, final, until,
@@ -166,7 +167,7 @@ def _forward_tile(  # type: ignore[no-untyped-def]
         write_tile(state, (1 + j) * BLOCKS, x0, y0, image, j)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def composite_forward(  # type: ignore[no-untyped-def]
     workers: int, tiles_x: int, offsets: Ints, members: Ints, screen: Floats, features: Floats,
     alpha_cut: np.float32, mask: npt.NDArray[np.bool_], image: Floats, transmittance: Floats,
@@ -202,7 +203,7 @@ def composite_forward(  # type: ignore[no-untyped-def]
             tile = take_number(taken)
 
 
-@njit(error_model="numpy")
+@helper
 def _backward_tile(  # type: ignore[no-untyped-def]
     tile, tiles_x, offsets, members, slots, screen, features, alpha_cut, transmittance, stop,
     blocks, d_image, d_transmittance, slot_sums, state, until, extra_sums,
@@ -310,7 +311,7 @@ def _backward_tile(  # type: ignore[no-untyped-def]
             )))  # fmt: skip
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel(parallel=True)
 def composite_backward(  # type: ignore[no-untyped-def]
     workers: int, tiles_x: int, offsets: Ints, members: Ints, slots: Ints, screen: Floats,
     features: Floats, alpha_cut: np.float32, transmittance: Floats, stop: Ints, blocks: Bits,

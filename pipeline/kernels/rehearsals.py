@@ -1,0 +1,124 @@
+"""Kernels compiled ahead: beside the first stages of a run, or for an image (`pipeline warmup`).
+
+A stage names its rehearsals: functions that run its kernels on something tiny. Compiling is one
+thread's work, so that they are shared out among processes; a kernel that two need is compiled by
+one. `python -m pipeline.kernels.rehearsals stages.fit.rehearsal:rasterizer` is such a process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from pipeline.kernels import folder as places
+from pipeline.kernels.folder import SUFFIX
+
+#: how much the run itself goes before
+NICENESS = 10
+
+
+class Background:
+    """Processes that compile the kernels of stages to come, if they are not there yet."""
+
+    def __init__(self) -> None:
+        self._running: list[subprocess.Popen[bytes]] = []
+
+    def start(self, stages: Iterable[str], processes: int) -> None:
+        """Begin; what can't be begun is left to the stages themselves."""
+        waiting = missing(stages)
+        shares = [waiting[k::processes] for k in range(min(processes, len(waiting)))]
+        with contextlib.suppress(OSError):
+            for share in shares:
+                self._running.append(_process(share))
+
+    def wait(self) -> bool:
+        """Wait for all of them; did all go well?"""
+        statuses = [process.wait() for process in self._running]
+        return not any(statuses)
+
+    def stop(self) -> None:
+        """End what still runs."""
+        for process in self._running:
+            process.terminate()
+        for process in self._running:
+            process.wait()
+        self._running = []
+
+
+def missing(stages: Iterable[str]) -> list[str]:
+    """Rehearsals of these stages that have not been held since anything changed."""
+    from pipeline.stage import get_stage
+
+    folders = places.readable()
+    return [
+        name
+        for stage in stages
+        for name in get_stage(stage).rehearsals
+        if not any((folder / _mark(name)).is_file() for folder in folders)
+    ]
+
+
+def hold(name: str) -> None:
+    """Hold a rehearsal here, and note it."""
+    module, _, function = name.partition(":")
+    getattr(importlib.import_module(module), function)()
+    folder = places.writable()
+    if folder is not None:
+        (folder / _mark(name)).touch()
+        places.tidy(folder, f"rehearsed.{name.replace(':', '.')}")
+
+
+def _process(names: Sequence[str]) -> subprocess.Popen[bytes]:
+    here = str(Path(__file__).resolve().parents[2])
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([here, *filter(None, sys.path)]),
+        # nothing here is worth a second thread
+        "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    }  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", __spec__.name, *names], env=environment,
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def _mark(name: str) -> str:
+    return f"rehearsed.{name.replace(':', '.')}-{_state()}-{SUFFIX}"
+
+
+@cache
+def _state() -> str:
+    """Hash of all that compiled kernels may depend on."""
+    root = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256()
+    for path in sorted([*(root / "stages").rglob("*.py"), *Path(__file__).parent.glob("*.py")]):
+        digest.update(path.read_bytes())
+    digest.update(repr((sys.version, version("numba"), version("llvmlite"))).encode())
+    digest.update(_processor().encode())
+    return digest.hexdigest()[:12]
+
+
+def _processor() -> str:
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return repr(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
+    return platform.processor()
+
+
+def main(names: Sequence[str]) -> None:
+    os.nice(NICENESS)
+    for name in names:
+        hold(name)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

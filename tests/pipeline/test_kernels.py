@@ -1,0 +1,206 @@
+"""Compiled kernels: kept, found again, never older than their source, wherever they can be kept."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.kernels import cache, folder, kernel, kernel_threads, news, rehearsals
+from pipeline.kernels import each as each_piece
+
+ROOT = Path(__file__).resolve().parents[2]
+KERNELS = """
+from pipeline.kernels import kernel
+from sums.parts import FACTOR, weighted
+
+@kernel()
+def total(values):
+    result = 0.0
+    for value in values:
+        result += weighted(value) * FACTOR
+    return result
+"""
+HELPERS = """
+from pipeline.kernels import helper
+
+FACTOR = 10
+
+@helper
+def weighted(value):
+    return 2 * value
+"""
+RUN = """
+import numpy as np
+from pipeline.kernels import news
+from sums.kernels import total
+
+compiled = []
+with news.told_to(compiled.append):
+    print(total(np.arange(4.0)), len(compiled))
+"""
+
+
+@pytest.fixture
+def sums(tmp_path):
+    """A package with a kernel in one file and its helper in another."""
+    package = tmp_path / "sums"
+    package.mkdir()
+    for name, text in (("__init__", ""), ("kernels", KERNELS), ("parts", HELPERS)):
+        (package / f"{name}.py").write_text(text)
+    return package
+
+
+def started(package: Path) -> subprocess.Popen[str]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(package.parent / "cache"),
+    }  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN], env=environment, stdout=subprocess.PIPE, text=True
+    )
+
+
+def run(package: Path) -> tuple[float, int]:
+    """What the kernel says in a process of its own, and how often it had to be compiled."""
+    value, compiled = started(package).communicate(timeout=120)[0].split()
+    return float(value), int(compiled)
+
+
+def kept(package: Path) -> list[str]:
+    return sorted(p.name for p in (package.parent / "cache" / "dentalsplat").iterdir())
+
+
+class TestSource:
+    def test_a_kernel_is_compiled_once(self, sums):
+        assert run(sums) == (120.0, 1)
+        assert run(sums) == (120.0, 0)
+        assert len(kept(sums)) == 1
+
+    def test_an_edited_helper_counts(self, sums):
+        run(sums)
+        parts = sums / "parts.py"
+        parts.write_text(HELPERS.replace("2 * value", "3 * value"))
+        assert run(sums) == (180.0, 1)
+        parts.write_text(HELPERS.replace("FACTOR = 10", "FACTOR = 1"))
+        assert run(sums) == (12.0, 1)
+        parts.write_text(HELPERS)
+        assert run(sums) == (120.0, 0)
+
+    def test_old_states_are_deleted(self, sums):
+        for factor in range(folder.KEPT + 2):
+            (sums / "parts.py").write_text(HELPERS.replace("10", str(factor)))
+            assert run(sums) == (12.0 * factor, 1)
+        assert len(kept(sums)) == folder.KEPT
+
+    def test_two_processes_at_once(self, sums):
+        both = [started(sums) for _ in range(2)]
+        values = [process.communicate(timeout=120)[0].split()[0] for process in both]
+        assert values == ["120.0", "120.0"]
+        assert len(kept(sums)) == 1
+
+    def test_half_a_file_is_none(self, sums):
+        run(sums)
+        (file,) = (sums.parent / "cache" / "dentalsplat").iterdir()
+        file.write_bytes(file.read_bytes()[:-100])
+        assert run(sums) == (120.0, 1)
+        assert run(sums) == (120.0, 0)
+
+
+def twice(values):
+    return values * 2
+
+
+class TestPlace:
+    @pytest.fixture
+    def nowhere(self, tmp_path):
+        """A folder that nobody can make, root included."""
+        (tmp_path / "file").touch()
+        return tmp_path / "file" / "kernels"
+
+    def test_first_that_can_be_written(self, tmp_path, nowhere, monkeypatch):
+        monkeypatch.setattr(folder, "folders", lambda: [nowhere, nowhere, tmp_path / "kernels"])
+        assert folder.writable() == tmp_path / "kernels"
+        assert (tmp_path / "kernels").stat().st_mode & 0o777 == 0o700
+        compiled = []
+        with news.told_to(compiled.append):
+            assert kernel()(twice)(3) == 6
+            assert kernel()(twice)(4) == 8  # from the disk
+        assert len(compiled) == 1
+
+    def test_none_can_be_written(self, nowhere, monkeypatch):
+        monkeypatch.setattr(folder, "folders", lambda: [nowhere])
+        monkeypatch.setattr(cache, "_told", [])
+        with pytest.warns(RuntimeWarning, match="can't be kept"):
+            assert kernel()(twice)(3) == 6
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert kernel()(twice)(4) == 8
+
+    def test_a_home_that_is_not_there(self, nowhere, tmp_path, monkeypatch):
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setenv("HOME", str(nowhere))
+        monkeypatch.setattr(folder.tempfile, "gettempdir", lambda: str(tmp_path))
+        package, *others = folder.folders()
+        assert package.is_relative_to(ROOT)
+        monkeypatch.setattr(folder, "folders", lambda: [nowhere, *others])
+        assert folder.writable() == tmp_path / f"dentalsplat-kernels-{os.getuid()}"
+
+    def test_what_others_can_write_is_not_read(self, tmp_path, nowhere, monkeypatch):
+        shared = tmp_path / "shared"
+        shared.mkdir()
+        shared.chmod(0o777)
+        monkeypatch.setattr(folder, "folders", lambda: [nowhere, shared])
+        assert folder.writable() is None
+        assert folder.readable() == []
+
+
+class TestThreads:
+    def test_each_piece_once(self):
+        done = np.zeros(100, np.int64)
+
+        def piece(k, step):
+            done[k] += step
+
+        each_piece(piece, 100, 3)
+        assert (done == 3).all()
+
+    def test_a_failure_is_passed_on(self):
+        def piece(k):
+            raise ValueError("no")
+
+        with pytest.raises(ValueError, match="no"):
+            each_piece(piece, 4)
+
+    def test_number_is_put_back(self):
+        import numba
+
+        before = numba.get_num_threads()
+        with kernel_threads(1):
+            assert numba.get_num_threads() == 1
+        assert numba.get_num_threads() == before
+
+
+class TestRehearsals:
+    def test_held_once(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(folder, "folders", lambda: [tmp_path])
+        before = rehearsals.missing(["flow"])
+        assert before == ["stages.flow.rehearsal:splatting"]
+        rehearsals.hold(before[0])
+        assert rehearsals.missing(["flow"]) == []
+
+    def test_processes_end_with_the_run(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+        background = rehearsals.Background()
+        background.start(["init", "fit"], processes=2)
+        processes = list(background._running)
+        assert len(processes) == 2
+        background.stop()
+        assert all(process.poll() is not None for process in processes)
