@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import RequestError
-from stages.fit.settings import FitSettings
+from stages.fit.config import FitSettings
 from stages.splatting.rasterizer import rasterize
 
 if TYPE_CHECKING:
@@ -73,8 +73,7 @@ def _disagreement(trainer: Trainer) -> str | None:
     """What is different on the card in the first view, or None."""
     target = trainer.targets[0][1]
     viewpoint = trainer.viewpoint(0, target)
-    if trainer.light is not None:
-        trainer.light.shade(trainer.packed, viewpoint)
+    trainer.shade(viewpoint)
     last = len(trainer.targets) - 1
     options: dict[str, Any] = {
         "degree": trainer.degree(), "near": trainer.settings.near, "depth": True,

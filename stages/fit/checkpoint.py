@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Arrays = dict[str, npt.NDArray[Any]]
+from stages.fit.parts.base import Arrays
 
 
 def save_checkpoint(path: Path, arrays: Arrays, facts: dict[str, Any]) -> None:

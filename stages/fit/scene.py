@@ -12,17 +12,11 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.flow import Flow
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
+from stages.fit.config import FitSettings
 from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
-from stages.fit.lens_light import LensLight, initial_material
-from stages.fit.progressive import Progressive
-from stages.fit.settings import FitSettings
-from stages.fit.surface import HeldSurface, along_normals
+from stages.fit.parts.base import Array, Floats, Start
 from stages.fit.targets import Target, make_pyramids, point_depth
-from stages.fit.trainer import Trainer
-from stages.fit.warp import Warp
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 Flows = dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]
 
@@ -58,56 +52,21 @@ class Scene:
     flows: Flows
     targets: list[dict[int, Target]]
 
-    def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
-        """A fit of the scene from its points, with a light beside the lens or with harmonics."""
-        if settings.progressive:
-            return self._one_after_another(settings)
-        thinned = self.start(settings)
-        packed = initial_gaussians(
-            thinned, self.cameras, opacity=settings.initial_opacity,
-            scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
-            degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
-        )  # fmt: skip
-        light = None
-        if lit:
-            images = [view.image for view in self.views]
-            masks = [view.valid() for view in self.views]
-            light = LensLight(
-                initial_material(
-                    thinned, self.cloud.positions, images, masks, self.cameras, settings
-                ),
-                settings,
-            )
-        held_surface = None
-        if settings.hold_surface:
-            along_normals(packed, thinned.normals, settings.hold_flatness)
-            held_surface = HeldSurface(
-                packed, thinned.normals, thinned.weight, settings.hold_strength,
-                settings.hold_growth,
-            )  # fmt: skip
-        warp = None
-        if settings.warp_levels:
-            pixel = 1 / max(camera.fx for camera in self.cameras)
-            spacing = max(settings.warp_spacing, settings.warp_spacing_px * pixel)
-            warp = Warp(
-                thinned.positions, thinned.normals, spacing, settings.warp_levels,
-                settings.steepest(lit), len(self.views),
-            )  # fmt: skip
+    def begin(self, settings: FitSettings, lit: bool) -> Start:
+        """What a fit of the scene starts from, with a light beside the lens or with harmonics."""
         extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
-        return Trainer(
-            packed, poses, middle, self.targets, extent, settings, light, held_surface, warp
-        )  # fmt: skip
-
-    def _one_after_another(self, settings: FitSettings) -> Trainer:
-        """A fit that begins with one view and places the others itself."""
-        progressive = Progressive(self.views, self.cameras, self.cloud.positions, settings)
-        first = progressive.order[0]
-        poses = np.repeat(self.cameras[first].cam_from_world[None, :3], len(self.cameras), 0)
-        return Trainer(
-            progressive.first_gaussians(), poses, first, self.targets, self.extent()[0], settings,
-            progressive=progressive,
-        )  # fmt: skip
+        start = Start(
+            settings, np.empty((0, 14), np.float32), poses, middle, self.targets, extent, lit, self
+        )
+        if not settings.progressive:
+            start.cloud = self.start(settings)
+            start.packed = initial_gaussians(
+                start.cloud, self.cameras, opacity=settings.initial_opacity,
+                scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
+                degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
+            )  # fmt: skip
+        return start
 
     def extent(self) -> tuple[float, int]:
         """Size of the scene that the position rate is relative to, and the view in the middle."""

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
-from stages.fit.background import Background
-from stages.fit.config import FitConfig
-from stages.fit.density import rotations
+from stages.fit.config import FitConfig, resolve
 from stages.fit.initial import Cloud, smooth_normals, thin
-from stages.fit.mcmc import add_noise, add_regularisers, relocate, shared
-from stages.fit.poses import SharedFocal
+from stages.fit.numerics.density import rotations
+from stages.fit.numerics.mcmc import add_noise, add_regularisers, relocate, shared
+from stages.fit.numerics.surface import HeldSurface, along_normals
+from stages.fit.parts.base import Start
+from stages.fit.parts.picture import Backdrop
+from stages.fit.parts.poses import SharedFocal
+from stages.fit.parts.surface import worth_holding
 from stages.fit.scene import out_of_place, trusted_points
-from stages.fit.settings import resolve
-from stages.fit.surface import HeldSurface, along_normals, worth_holding
-from stages.fit.targets import make_target
+from stages.fit.targets import Target, make_target
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -164,9 +165,6 @@ def test_the_shared_focal_walks_to_where_its_gradient_ends() -> None:
     assert focal.apply(intrinsics)[0] == pytest.approx(104, abs=0.2)
     assert focal.apply(intrinsics)[1] == pytest.approx(124.8, abs=0.3)
     assert focal.apply(intrinsics)[2:].tolist() == [50, 40]
-    other = SharedFocal()
-    other.restore(focal.state())
-    assert other.state() == focal.state()
 
 
 def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
@@ -184,25 +182,25 @@ def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
 
 
 def test_what_a_held_surface_changes_unless_the_user_says_otherwise() -> None:
-    free = resolve(FitConfig().model_dump(), 3, 0)
-    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    free = resolve(FitConfig(), 3, 0)
+    held = resolve(FitConfig(), 3, 0, held=True)
     assert not free.hold_surface and held.hold_surface
     assert held.initial_points > free.initial_points
-    off = resolve(FitConfig(hold_surface=False).model_dump(), 3, 0, held=True)
+    off = resolve(FitConfig(hold_surface=False), 3, 0, held=True)
     assert off == free
-    chosen = resolve(FitConfig(hold_surface=True, sh_degree=0).model_dump(), 3, 0)
+    chosen = resolve(FitConfig(hold_surface=True, sh_degree=0), 3, 0)
     assert chosen.hold_surface and chosen.sh_degree == 0
 
 
 def test_settings_follow_the_number_of_views() -> None:
-    few, many, plenty = (resolve(FitConfig().model_dump(), views, 0) for views in (3, 6, 9))
+    few, many, plenty = (resolve(FitConfig(), views, 0) for views in (3, 6, 9))
     assert few.fill_share > 0 and many.fill_share == plenty.fill_share == 0
     assert (few.densify, many.densify, plenty.densify) == (False, True, True)
     assert (few.sh_degree, many.sh_degree, plenty.sh_degree) == (1, 1, 2)
-    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    held = resolve(FitConfig(), 3, 0, held=True)
     assert held.light_strength_lr == 0 < few.light_strength_lr
     assert held.light_strengths[0] < few.light_strengths[0]
-    said = resolve(FitConfig(fill_share=0.5, light_strengths=(1.0, 0.1)).model_dump(), 9, 0)
+    said = resolve(FitConfig(fill_share=0.5, light_strengths=(1.0, 0.1)), 9, 0)
     assert (said.fill_share, said.light_strengths) == (0.5, (1.0, 0.1))
 
 
@@ -211,22 +209,25 @@ def test_the_background_is_found_where_nothing_is_masked_out() -> None:
     image = np.full((12, 16, 3), 0.5, np.float32)
     whole = make_target(image, np.ones((12, 16), bool), camera, 1, None)
     masked = make_target(image, np.arange(12)[:, None] < np.full(16, 6), camera, 1, None)
-    settings = resolve(FitConfig(background_lr=0.02).model_dump(), 3, 0)
+
+    def behind(targets: list[dict[int, Target]], **config) -> Backdrop:
+        settings = resolve(FitConfig(background_lr=0.02, **config), 3, 0)
+        return Backdrop(Start(settings, np.empty((0, 14)), np.empty((0, 3, 4)), 0, targets, 1.0))
+
     empty, clear = np.zeros((3, 12, 16), np.float32), np.ones((12, 16), np.float32)
 
-    background = Background(settings, [{1: whole}])
+    found = behind([{1: whole}])
     for _ in range(200):
-        shown = background.behind(empty, clear)
-        background.step(whole.colour(shown, 0.0).gradient, clear)
-    assert background.values == pytest.approx(0.5, abs=0.03)
-    again = Background(settings, [{1: whole}])
-    again.restore(background.state())
-    assert again.state() == background.state()
+        shown = found.show(0, empty, clear)
+        found.colour.step(whole.colour(shown, 0.0).gradient, clear)
+    assert found.colour.values == pytest.approx(0.5, abs=0.03)
+    again = behind([{1: whole}])
+    again.restore(found.arrays())
+    assert again.colour.steps == 200 and np.array_equal(again.colour.values, found.colour.values)
 
-    black = Background(settings, [{1: whole}, {1: masked}])
-    black.step(whole.colour(empty, 0.0).gradient, clear)
-    assert not black.values.any()
-    given = FitConfig(background=(0.2, 0.3, 0.4)).model_dump()
-    fixed = Background(resolve(given, 3, 0), [{1: whole}])
-    fixed.step(whole.colour(empty, 0.0).gradient, clear)
-    assert fixed.values.tolist() == [0.2, 0.3, 0.4]
+    black = behind([{1: whole}, {1: masked}])
+    black.colour.step(whole.colour(empty, 0.0).gradient, clear)
+    assert not black.colour.values.any()
+    fixed = behind([{1: whole}], background=(0.2, 0.3, 0.4))
+    fixed.colour.step(whole.colour(empty, 0.0).gradient, clear)
+    assert fixed.colour.values.tolist() == [0.2, 0.3, 0.4]

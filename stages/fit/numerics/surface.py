@@ -7,45 +7,16 @@ takes them off it is drawn back after every step. The surface itself may bend as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from pipeline.artifacts.cameras import Camera
-from stages.fit.checkpoint import Arrays
-from stages.fit.warp import turned
+from stages.fit.numerics.warp import turned
 from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 F = np.float32
-
-#: up to so many views, a surface can be held
-FEW_VIEWS = 3
-
-
-def worth_holding(cameras: Sequence[Camera], positions: Array, least_angle: float) -> bool:
-    """Whether Gaussians should be held to the surface of the points.
-
-    Where neighbouring views are too far apart to be matched, the points are a surface that was
-    inferred as a whole, and the photographs can't correct it. Where views do overlap closely,
-    holding costs more than it gives.
-
-    Args:
-        cameras: the placed ones.
-        positions: [N, 3] the points, in the world of the cameras.
-        least_angle: degrees that every two views are apart, seen from the middle of the points.
-    """
-    if not 2 <= len(cameras) <= FEW_VIEWS:
-        return False
-    rays = np.array([camera.centre for camera in cameras]) - np.median(positions, axis=0)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    cosines = rays @ rays.T
-    np.fill_diagonal(cosines, -1)
-    closest = np.degrees(np.arccos(np.clip(cosines.max(), -1, 1)))
-    return bool(closest > least_angle)
 
 
 def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
@@ -129,11 +100,3 @@ class HeldSurface:
         """Rows follow those of the packed scene."""
         self.anchor = np.ascontiguousarray(self.anchor[source])
         self.turn = np.ascontiguousarray(self.turn[source])
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        return {"held_anchor": self.anchor, "held_turn": self.turn}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take up what `arrays` gave."""
-        self.anchor, self.turn = arrays["held_anchor"], arrays["held_turn"]

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from stages.fit.settings import FitSettings
-from stages.fit.targets import Target
 from stages.splatting.threads import KERNELS
 
 Array = npt.NDArray[np.float64]
@@ -52,21 +49,15 @@ def _pull_back(  # type: ignore[no-untyped-def]
 class Background:
     """One sRGB colour, and Adam on it.
 
-    What no Gaussian stands before still has a colour: a dark throat, a cheek out of focus. Where
-    part of the photographs is masked out, nobody knows what is behind, and it stays black.
-
     Attributes:
         values: [3] float64 in 0..1.
-        learned: whether it is found by the fit, or given.
+        learned: whether it is found by the fit, or given; rate: of learning.
     """
 
-    def __init__(self, settings: FitSettings, targets: Sequence[dict[int, Target]]) -> None:
-        given = settings.background
-        whole = all(bool(view[min(view)].colour.mask.all()) for view in targets)
-        # a view that is still to be placed must not find what is missing painted behind
-        self.learned = given == "auto" and whole and not settings.progressive
-        self.values = np.zeros(3) if given == "auto" else np.array(given, np.float64)
-        self.rate = settings.background_lr
+    def __init__(self, values: Sequence[float], learned: bool, rate: float) -> None:
+        self.values = np.array(values, np.float64)
+        self.learned = learned
+        self.rate = rate
         self.moments = np.zeros((2, 3))
         self.steps = 0
 
@@ -104,14 +95,3 @@ class Background:
         mean = self.moments[0] / (1 - 0.9**self.steps)
         spread = np.sqrt(self.moments[1] / (1 - 0.99**self.steps))
         self.values = np.clip(self.values - self.rate * mean / (spread + 1e-15), 0, 1)
-
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return {
-            "values": self.values.tolist(), "moments": self.moments.tolist(), "steps": self.steps
-        }  # fmt: skip
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `state` gave."""
-        self.values, self.moments = np.array(state["values"]), np.array(state["moments"])
-        self.steps = state["steps"]

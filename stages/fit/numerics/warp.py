@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from stages.fit.checkpoint import Arrays
-from stages.fit.spline_field import SplineField
+from stages.fit.numerics.spline_field import SplineField
 from stages.splatting.adam import Adam
 from stages.splatting.threads import KERNELS
 
@@ -119,30 +118,6 @@ class Warp:
         self.field.select(source)
         for name in ("normals", "facing", "gradient", "shape"):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[source]))
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        return {
-            "warp_coefficients": self.field.coefficients,
-            "warp_nodes": self.field.nodes,
-            "warp_offsets": self.field.offsets,
-            "warp_normals": self.normals,
-            "warp_facing": self.facing,
-            "warp_shape": self.shape,
-            "warp_gradient": self.gradient,
-            "warp_first": self.adam.first,
-            "warp_second": self.adam.second,
-            "warp_steps": np.array([self.adam.steps, self.collected]),
-        }
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take up what `arrays` gave."""
-        self.field.coefficients = arrays["warp_coefficients"]
-        self.field.nodes, self.field.offsets = arrays["warp_nodes"], arrays["warp_offsets"]
-        self.normals, self.facing = arrays["warp_normals"], arrays["warp_facing"]
-        self.shape, self.gradient = arrays["warp_shape"], arrays["warp_gradient"]
-        self.adam.first, self.adam.second = arrays["warp_first"], arrays["warp_second"]
-        self.adam.steps, self.collected = (int(n) for n in arrays["warp_steps"])
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from numba import njit, prange
 from scipy.spatial import cKDTree
 
-from stages.fit.checkpoint import Arrays
 from stages.splatting.lane_types import WIDTH
 from stages.splatting.lanes import (
     at_least,
@@ -143,14 +142,3 @@ class TotalVariation:
     def forget(self) -> None:
         """Other Gaussians have taken the place of those that were compared."""
         self.neighbours = None
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        if self.neighbours is None:
-            return {}
-        return {"variation_neighbours": self.neighbours, "variation_starts": self.starts}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take up what `arrays` gave."""
-        self.neighbours = arrays.get("variation_neighbours")
-        self.starts = arrays.get("variation_starts", self.starts)

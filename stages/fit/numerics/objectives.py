@@ -125,14 +125,3 @@ def flow_loss(
         count = max(float(count), 1.0)
         _pull_to_flow(*given, F(weight / count), d_planes, d_transmittance)
     return float(total) / count
-
-
-def interpolate(start: float, end: float, done: float) -> float:
-    """Exponential from `start` (done = 0) to `end` (done = 1); linear where one of them is 0."""
-    if start <= 0 or end <= 0:
-        return start + (end - start) * done
-    return float(start * (end / start) ** done)
-
-
-def logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))

@@ -12,7 +12,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from stages.fit.density import rotations
+from stages.fit.numerics.density import rotations
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]

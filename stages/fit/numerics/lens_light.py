@@ -9,11 +9,10 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Light
-from stages.fit.checkpoint import Arrays
+from stages.fit.config import FitSettings
 from stages.fit.initial import Cloud, facing
-from stages.fit.settings import FitSettings
+from stages.fit.numerics.total_variation import TotalVariation
 from stages.fit.targets import point_depth
-from stages.fit.total_variation import TotalVariation
 from stages.splatting.adam import Adam
 from stages.splatting.light import shade, shade_backward
 from stages.splatting.rasterizer import Gradients, Viewpoint
@@ -65,14 +64,14 @@ class LensLight:
 
     def step(
         self, packed: Floats, viewpoint: Viewpoint, gradients: Gradients,
-        variation: TotalVariation, done: float,
+        variation: TotalVariation | None, done: float,
     ) -> Array:  # fmt: skip
         """One step of material and light after `shade` and the rasterizer's backward pass.
 
         Args:
             packed, viewpoint: as `shade` had and left them.
             gradients: of the rasterizer; what reaches the positions is added.
-            variation: of the albedos.
+            variation: of the albedos, if it counts.
             done: share of the fit that is over, 0..1; rates fall with it.
 
         Returns:
@@ -84,7 +83,8 @@ class LensLight:
             self.radiance, gradients.packed,
         )  # fmt: skip
         gradients.packed[:, 11:14] = 0
-        variation.add(packed[:, :3], self.material, 0, 3, result.material)
+        if variation is not None:
+            variation.add(packed[:, :3], self.material, 0, 3, result.material)
         fall = s.light_lr_decay**done
         rates = np.empty(6, np.float32)
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall
@@ -136,26 +136,6 @@ class LensLight:
             self.material[:, :3].copy(), self.normals(), diffuse_share=k, falloff=p,
             distance=scale, widths=(m1, m2), strengths=(s1, s2), gamma=self.settings.light_gamma,
         )  # fmt: skip
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        return {
-            "light_material": self.material,
-            "light_adam_first": self.adam.first,
-            "light_adam_second": self.adam.second,
-            "light_values": self.values,
-            "light_first": self.first,
-            "light_second": self.second,
-        }
-
-    def restore(self, arrays: Arrays, steps: int) -> None:
-        """Take up what `arrays` gave."""
-        self.material = arrays["light_material"]
-        self.adam.first = arrays["light_adam_first"]
-        self.adam.second = arrays["light_adam_second"]
-        self.adam.steps = steps
-        self.values = arrays["light_values"]
-        self.first, self.second = arrays["light_first"], arrays["light_second"]
 
 
 def initial_material(

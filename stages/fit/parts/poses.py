@@ -1,14 +1,60 @@
-"""Refinement of the camera poses: a twist per step and view, Adam, one camera held."""
+"""Refinement of cameras: a twist per step and view, one held; one factor of the focal length."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.geometry.rigid import moved_by
+from stages.fit.parts.base import Array, Floats, Part, Step, interpolate
+from stages.fit.settings import AutoFloat, PartSettings, Positive, Whole, automatic
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+
+class Poses(
+    Part, name="poses", switch="optimize_poses", present={"optimize_poses": True},
+    absent={"optimize_poses": False},
+):  # fmt: skip
+    """Camera poses are refined with the Gaussians."""
+
+    class Settings(PartSettings):
+        optimize_poses: bool = True
+        """refine the camera poses as well"""
+        pose_lr_init: AutoFloat = automatic({3: 3e-4})
+        """learning rate of pose increments at the start, radians and units of the scene's depth"""
+        pose_lr_final: AutoFloat = automatic({3: 3e-6})
+        """learning rate of pose increments at the end"""
+        pose_from_iter: Whole = 0
+        """first iteration that refines poses"""
+
+    def follow(self, fit: Trainer, step: Step) -> None:
+        s = self.settings
+        if fit.iteration < s.pose_from_iter:
+            return
+        rate = interpolate(s.pose_lr_init, s.pose_lr_final, step.done)
+        fit.poses.step(step.view, step.by_pose, rate)
+        if step.flow is not None:
+            fit.poses.step(step.flow.to, step.gradients.next_pose, rate)
+
+
+class Focal(
+    Part, name="focal", switch="optimize_focal", present={"optimize_focal": True},
+    absent={"optimize_focal": False},
+):  # fmt: skip
+    """The focal length is refined, by one factor that all views share."""
+
+    class Settings(PartSettings):
+        optimize_focal: bool = False
+        """refine the focal length as well, by one factor that all views share"""
+        focal_lr: Positive = 1e-4
+        """learning rate of that factor's logarithm"""
+
+    def follow(self, fit: Trainer, step: Step) -> None:
+        rate = self.settings.focal_lr
+        fit.focal.step(step.gradients.focal, step.viewpoint.intrinsics, rate)
 
 
 class PoseOptimizer:
@@ -79,11 +125,3 @@ class SharedFocal:
         mean = self.first / (1 - 0.9**self.steps)
         spread = (self.second / (1 - 0.999**self.steps)) ** 0.5
         self.log_factor -= rate * mean / (spread + 1e-15)
-
-    def state(self) -> list[float]:
-        return [self.log_factor, self.first, self.second, self.steps]
-
-    def restore(self, state: list[float]) -> None:
-        """Take up what `state` gave."""
-        self.log_factor, self.first, self.second = state[:3]
-        self.steps = int(state[3])

@@ -1,0 +1,161 @@
+"""Gaussians are born and die, by cloning and splitting (3DGS, AbsGS) or sampling (3DGS-MCMC)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from stages.fit.parts.base import Bools, Indices, Part, Start, Step, logit
+from stages.fit.settings import (
+    AutoBool,
+    AutoInt,
+    Count,
+    PartSettings,
+    Positive,
+    Weight,
+    Whole,
+    automatic,
+)
+
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+#: iterations before the end at which Gaussians are split last: these still need steps to settle
+SETTLE = 100
+
+
+class Density(
+    Part, name="density", switch="densify", present={"densify": True}, absent={"densify": False},
+    kept=("statistics.signed", "statistics.absolute", "statistics.seen"),
+):  # fmt: skip
+    """Large gradients on the screen decide on clones and splits.
+
+    Attributes:
+        statistics: of the gradients since the last densification.
+    """
+
+    class Settings(PartSettings):
+        densify: AutoBool = automatic({3: False, 6: True})
+        """clone and split Gaussians"""
+        strategy: Literal["default", "mcmc"] = "default"
+        """densify by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"""
+        absgrad: Literal["split", "both", "off"] = "split"
+        """absolute gradients decide on: splits (AbsGS), splits and clones (gsplat), neither
+        (3DGS)"""
+        densify_from_iter: Whole = 300
+        """first iteration of densification"""
+        densify_until_iter: AutoInt = automatic(f"{SETTLE} before the end")
+        """last iteration of densification"""
+        densification_interval: Count = 100
+        """iterations between densifications"""
+        densify_grad_threshold: Positive = 2e-4
+        """signed screen gradient above which Gaussians are densified"""
+        densify_abs_grad_threshold: Positive = 4e-4
+        """absolute screen gradient above which Gaussians are densified"""
+        percent_dense: Positive = 1e-3
+        """Gaussians up to this share of the extent are cloned, larger ones split"""
+        max_gaussians: AutoInt = automatic({3: 15000, 6: 60000}, ge=1)
+        """densification stops here; the largest gradients come first"""
+        opacity_reset_interval: Whole = 3000
+        """iterations between opacity resets; 0: never"""
+        prune_opacity: Annotated[float, Field(gt=0, lt=0.5)] = 0.005
+        """Gaussians below this opacity are removed"""
+
+    def __init__(self, start: Start) -> None:
+        from stages.fit.numerics.density import DensityStatistics
+
+        super().__init__(start)
+        self.statistics = DensityStatistics.empty(len(start.packed))
+
+    @classmethod
+    def of(cls, start: Start) -> Part | None:
+        wanted = "mcmc" if cls.name == "mcmc" else "default"
+        return super().of(start) if start.settings.strategy == wanted else None
+
+    def due(self, now: int) -> bool:
+        s = self.settings
+        within = s.densify_from_iter <= now <= s.densify_until_iter
+        return within and now % s.densification_interval == 0
+
+    def populate(self, fit: Trainer, step: Step) -> None:
+        from stages.fit.numerics.density import choose, grow
+
+        s = self.settings
+        self.statistics.add(
+            step.gradients.centres, step.gradients.absolute, step.rendering.visible,
+            step.target.width, step.target.height,
+        )  # fmt: skip
+        if self.due(fit.iteration):
+            largest = np.exp(fit.packed[:, 7:10]).max(1)
+            clone, split = choose(
+                self.statistics, largest, small=s.percent_dense * fit.extent, absgrad=s.absgrad,
+                grad_threshold=s.densify_grad_threshold,
+                abs_grad_threshold=s.densify_abs_grad_threshold,
+                room=s.max_gaussians - len(fit.packed),
+            )  # fmt: skip
+            keep = fit.packed[:, 10] > logit(s.prune_opacity)
+            fit.replace(*grow(fit.packed, clone, split, keep, fit.random))
+        if s.opacity_reset_interval > 0 and fit.iteration % s.opacity_reset_interval == 0:
+            ceiling = np.float32(logit(2 * s.prune_opacity))
+            fit.packed[:, 10] = np.minimum(fit.packed[:, 10], ceiling)
+            fit.adam.first[:, 10] = 0
+            fit.adam.second[:, 10] = 0
+
+    def select(self, source: Indices, fresh: Bools) -> None:
+        self.statistics = self.statistics.empty(len(source))
+
+
+class Mcmc(
+    Density, name="mcmc", switch="densify",
+    present={"densify": True, "strategy": "mcmc", "opacity_reg": 0.01, "scale_reg": 0.01},
+):  # fmt: skip
+    """The dead move to the living, and noise keeps the positions exploring."""
+
+    class Settings(PartSettings):
+        noise_lr: Weight = 5e5
+        """mcmc: noise, relative to the learning rate of positions"""
+        opacity_reg: Weight = 0.0
+        """weight of the mean opacity in the loss (mcmc: 0.01)"""
+        scale_reg: Weight = 0.0
+        """weight of the mean scale in the loss (mcmc: 0.01)"""
+
+    def follow(self, fit: Trainer, step: Step) -> None:
+        from stages.fit.numerics.mcmc import add_noise
+
+        add_noise(fit.packed, self.settings.noise_lr * float(step.rates[0]), fit.random)
+
+    def populate(self, fit: Trainer, step: Step) -> None:
+        from stages.fit.numerics.mcmc import relocate
+
+        s = self.settings
+        if self.due(fit.iteration):
+            fit.replace(*relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random))
+
+
+class Shape(
+    Part, name="isotropic", switch="", present={"isotropic": True}, absent={"isotropic": False}
+):
+    """Opacity and scale have a price, and scales may be kept equal."""
+
+    class Settings(PartSettings):
+        isotropic: bool = False
+        """keep the three scales of each Gaussian equal"""
+
+    @classmethod
+    def of(cls, start: Start) -> Part | None:
+        s = start.settings
+        return cls(start) if s.isotropic or s.opacity_reg > 0 or s.scale_reg > 0 else None
+
+    def guide(self, fit: Trainer, step: Step) -> None:
+        from stages.fit.numerics.mcmc import add_regularisers
+
+        s, gradient = self.settings, step.gradients.packed
+        add_regularisers(fit.packed, gradient, s.opacity_reg, s.scale_reg)
+        if s.isotropic:
+            gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
+
+    def pace(self, step: Step) -> None:
+        if self.settings.isotropic:
+            step.rates[3:7] = 0
