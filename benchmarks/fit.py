@@ -75,14 +75,10 @@ def watch_the_trainer() -> Clock:
     clock.watch(trainer.Trainer, "_compare", "loss")
     clock.watch(ColourLoss, "__call__", "loss")
     clock.watch(Adam, "step", "optimiser")
+    hooks = {"guide": "optimiser", "follow": "optimiser", "populate": "density"}
     for kind in parts.PARTS:
-        for hook, part in (
-            ("guide", "optimiser"),
-            ("follow", "optimiser"),
-            ("populate", "density"),
-        ):
-            if hook in vars(kind):
-                clock.watch(kind, hook, what)
+        for hook in hooks.keys() & vars(kind).keys():
+            clock.watch(kind, hook, hooks[hook])
     return clock
 
 

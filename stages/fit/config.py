@@ -8,16 +8,16 @@ from pydantic import Field, model_validator
 
 from pipeline.stage import runtime
 from stages.fit.parts import PARTS
-from stages.fit.parts.density import SETTLE, Density, Mcmc, Shape
+from stages.fit.parts.density import SETTLE, Density, Isotropic, Mcmc
 from stages.fit.parts.floaters import Floaters
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
-from stages.fit.parts.picture import Backdrop, Exposure
+from stages.fit.parts.picture import Background, Exposure
 from stages.fit.parts.poses import Focal, Poses
 from stages.fit.parts.progressive import Progressive
 from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
 from stages.fit.parts.surface import Surface
-from stages.fit.parts.warp import Bending
+from stages.fit.parts.warp import Warp
 from stages.fit.settings import (
     AUTO,
     AutoFloat,
@@ -85,8 +85,8 @@ class Basics(PartSettings):
 
 
 class FitConfig(
-    Floaters.Settings, Backdrop.Settings, Exposure.Settings, Mcmc.Settings, Density.Settings,
-    Bending.Settings, Surface.Settings, Shape.Settings, Focal.Settings, Progressive.Settings,
+    Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings, Density.Settings,
+    Warp.Settings, Surface.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings,
     Poses.Settings, Coarse.Settings, Variation.Settings, Depth.Settings, Flow.Settings,
     Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
 ):  # fmt: skip

@@ -18,7 +18,7 @@ from stages.fit.config import FitSettings
 from stages.fit.initial import Frame
 from stages.fit.lighting import choose_light, harmonics_for_viewers
 from stages.fit.parts.light import Light
-from stages.fit.parts.picture import Backdrop
+from stages.fit.parts.picture import Background
 from stages.fit.scene import prepare
 from stages.fit.trainer import Trainer
 from stages.splatting.rasterizer import rasterize, unpack, use_threads
@@ -73,7 +73,7 @@ def fit(
     figures: dict[str, float] = {}
     if light == "auto":
         light, figures = choose_light(scene, settings)
-    trainer = Trainer(scene.begin(settings, light == "camera"))
+    trainer = scene.trainer(settings, light == "camera")
     note = use_backend(trainer)
     trainer.run(checkpoint, report, diary)
     for part in trainer.parts:
@@ -115,7 +115,7 @@ def finished(trainer: Trainer, cameras: Sequence[Camera], frame: Frame) -> Gauss
         frame: of the fit.
     """
     gaussians = unpack(trainer.packed)
-    light, backdrop = trainer.find(Light), trainer.find(Backdrop)
+    light, backdrop = trainer.find(Light), trainer.find(Background)
     if light is not None:
         gaussians = replace(
             unpack(harmonics_for_viewers(trainer, cameras).packed),

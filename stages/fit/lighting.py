@@ -11,9 +11,8 @@ from pipeline.errors import ReconstructionError
 from stages.fit.config import FitSettings
 from stages.fit.initial import facing, headlight_harmonics
 from stages.fit.numerics.evidence import prediction_errors
-from stages.fit.parts.base import Start
 from stages.fit.parts.light import Light
-from stages.fit.parts.picture import Backdrop, Exposure
+from stages.fit.parts.picture import Background, Exposure
 from stages.fit.scene import Scene
 from stages.fit.trainer import Trainer
 from stages.splatting.projection import HARMONICS
@@ -68,7 +67,7 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
     camera = scene.cameras[held]
     scores = {}
     for name, lit in (("none", False), ("camera", True)):
-        trainer = Trainer(rest.begin(trial, lit))
+        trainer = rest.trainer(trial, lit)
         try:
             trainer.run(None, lambda *_: None)
         except ReconstructionError:  # it diverged; if the fit does as well, it says so
@@ -94,7 +93,7 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         trainer: a finished fit with a light.
         cameras: in its frame.
     """
-    part, backdrop, s = trainer.find(Light), trainer.find(Backdrop), trainer.settings
+    part, backdrop, s = trainer.find(Light), trainer.find(Background), trainer.settings
     assert part is not None and backdrop is not None
     positions = trainer.packed[:, :3].astype(np.float64)
     normals = part.model.normals().astype(np.float64)
@@ -114,10 +113,8 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         background=tuple(backdrop.colour.values.tolist()),
     )  # fmt: skip
     second = Trainer(
-        Start(
-            colours_only, np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held,
-            trainer.targets, trainer.extent,
-        )
+        colours_only, np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held,
+        trainer.targets, trainer.extent,
     )  # fmt: skip
     first, exposure = trainer.find(Exposure), second.find(Exposure)
     if first is not None and exposure is not None:

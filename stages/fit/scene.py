@@ -14,8 +14,9 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from stages.fit.config import FitSettings
 from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
-from stages.fit.parts.base import Array, Floats, Start
+from stages.fit.parts.base import Array, Floats
 from stages.fit.targets import Target, make_pyramids, point_depth
+from stages.fit.trainer import Trainer
 
 Bools = npt.NDArray[np.bool_]
 Flows = dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]
@@ -52,21 +53,19 @@ class Scene:
     flows: Flows
     targets: list[dict[int, Target]]
 
-    def begin(self, settings: FitSettings, lit: bool) -> Start:
-        """What a fit of the scene starts from, with a light beside the lens or with harmonics."""
-        extent, middle = self.extent()
-        poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
-        start = Start(
-            settings, np.empty((0, 14), np.float32), poses, middle, self.targets, extent, lit, self
-        )
+    def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
+        """A fit of the scene from its points, with a light beside the lens or with harmonics."""
+        cloud, packed = None, np.empty((0, 14), np.float32)
         if not settings.progressive:
-            start.cloud = self.start(settings)
-            start.packed = initial_gaussians(
-                start.cloud, self.cameras, opacity=settings.initial_opacity,
+            cloud = self.start(settings)
+            packed = initial_gaussians(
+                cloud, self.cameras, opacity=settings.initial_opacity,
                 scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
                 degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
             )  # fmt: skip
-        return start
+        extent, middle = self.extent()
+        poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
+        return Trainer(settings, packed, poses, middle, self.targets, extent, lit, self, cloud)
 
     def extent(self) -> tuple[float, int]:
         """Size of the scene that the position rate is relative to, and the view in the middle."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isqrt
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from stages.fit.parts.base import (
     Array,
     Floats,
     Part,
-    Start,
     Step,
     interpolate,
     restore_state,
@@ -30,6 +29,11 @@ from stages.fit.targets import Target
 from stages.splatting.adam import Adam
 from stages.splatting.projection import HARMONICS
 from stages.splatting.rasterizer import Rendering, Viewpoint, rasterize
+
+if TYPE_CHECKING:
+    from stages.fit.config import FitSettings
+    from stages.fit.initial import Cloud
+    from stages.fit.scene import Scene
 
 P = TypeVar("P", bound=Part)
 
@@ -59,12 +63,34 @@ class Trainer:
         "focal.steps", "iteration", "loss", "psnr", "best_loss", "curve",
     )  # fmt: skip
 
-    def __init__(self, start: Start) -> None:
-        self.parts = [part for kind in PARTS if (part := kind.of(start)) is not None]
-        self.settings = start.settings
-        self.targets, self.extent, self.lit = start.targets, start.extent, start.lit
-        self.packed = start.packed
-        self.poses, self.focal = PoseOptimizer(start.poses, start.held), SharedFocal()
+    def __init__(
+        self,
+        settings: FitSettings,
+        packed: Floats,
+        poses: Array,
+        held: int,
+        targets: Sequence[dict[int, Target]],
+        extent: float,
+        lit: bool = False,
+        scene: Scene | None = None,
+        cloud: Cloud | None = None,
+    ) -> None:
+        """
+        Args:
+            settings: all of them.
+            packed: [N, 11 + 3 K] initial Gaussians (K = 1 with a light).
+            poses: [V, 3, 4] cam_from_frame.
+            held: the camera whose pose is not refined.
+            targets: per view, factor -> target.
+            extent: size of the scene that the position rate is relative to.
+            lit: by a light beside the lens, in place of harmonics.
+            scene: that it is a fit of; None where only colours are fitted once more.
+            cloud: the points that became Gaussians; None where they are found view by view.
+        """
+        self.settings, self.packed, self.targets, self.extent = settings, packed, targets, extent
+        self.lit, self.scene, self.cloud = lit, scene, cloud
+        self.poses, self.focal = PoseOptimizer(poses, held), SharedFocal()
+        self.parts = [part for kind in PARTS if (part := kind.of(self)) is not None]
         self.adam = Adam(self.packed.shape, 0.9, 0.999, 1e-15)
         self.rasterize: Callable[..., Any] = rasterize
         self.random = np.random.Generator(np.random.PCG64(self.settings.seed))

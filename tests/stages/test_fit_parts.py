@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,8 +13,7 @@ from stages.fit.initial import Cloud, smooth_normals, thin
 from stages.fit.numerics.density import rotations
 from stages.fit.numerics.mcmc import add_noise, add_regularisers, relocate, shared
 from stages.fit.numerics.surface import HeldSurface, along_normals
-from stages.fit.parts.base import Start
-from stages.fit.parts.picture import Backdrop
+from stages.fit.parts.picture import Background
 from stages.fit.parts.poses import SharedFocal
 from stages.fit.parts.surface import worth_holding
 from stages.fit.scene import out_of_place, trusted_points
@@ -210,9 +211,9 @@ def test_the_background_is_found_where_nothing_is_masked_out() -> None:
     whole = make_target(image, np.ones((12, 16), bool), camera, 1, None)
     masked = make_target(image, np.arange(12)[:, None] < np.full(16, 6), camera, 1, None)
 
-    def behind(targets: list[dict[int, Target]], **config) -> Backdrop:
+    def behind(targets: list[dict[int, Target]], **config) -> Background:
         settings = resolve(FitConfig(background_lr=0.02, **config), 3, 0)
-        return Backdrop(Start(settings, np.empty((0, 14)), np.empty((0, 3, 4)), 0, targets, 1.0))
+        return Background(SimpleNamespace(settings=settings, targets=targets))
 
     empty, clear = np.zeros((3, 12, 16), np.float32), np.ones((12, 16), np.float32)
 

@@ -14,9 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from stages.fit.config import FitSettings
-    from stages.fit.initial import Cloud
-    from stages.fit.scene import Scene
     from stages.fit.targets import FlowTarget, Target
     from stages.fit.trainer import Trainer
     from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint
@@ -27,33 +24,6 @@ Indices = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 Arrays = dict[str, npt.NDArray[Any]]
 Figures = dict[str, float | int | str]
-
-
-@dataclass
-class Start:
-    """What a fit starts from, in a frame where the scene's depth is about 1.
-
-    Attributes:
-        settings: all of them.
-        packed: [N, 11 + 3 K] float32 initial Gaussians (K = 1 with a light).
-        poses: [V, 3, 4] cam_from_frame.
-        held: the camera whose pose is not refined.
-        targets: per view, factor -> target.
-        extent: size of the scene that the position rate is relative to.
-        lit: by a light beside the lens, in place of harmonics.
-        scene: that it is a fit of; None where only colours are fitted once more.
-        cloud: the points that became Gaussians; None where they are found view by view.
-    """
-
-    settings: FitSettings
-    packed: Floats
-    poses: Array
-    held: int
-    targets: Sequence[dict[int, Target]]
-    extent: float
-    lit: bool = False
-    scene: Scene | None = None
-    cloud: Cloud | None = None
 
 
 @dataclass
@@ -95,48 +65,46 @@ class Step:
 class Part:
     """A part that does nothing; each of them overrides what it has a say in.
 
-    What follows is said where a part's class is declared. `Settings`, in it, are its settings.
+    `Settings`, in each of them, are its settings. What follows is said where a class is declared.
 
     Attributes:
-        name: in ``fit.parts``.
+        name: in ``fit.parts``: that of the class.
         switch: the setting that is 0 or False where a fit is without the part; ``""``: never; None:
             the part is settings and nothing else.
-        needs: attributes of `Start` that are not None where there can be such a part.
-        present, absent: what its settings are in a method that names its parts, with it among them
-            or not, where the method does not say otherwise.
+        needs: attributes of a fit that are not None where there can be such a part.
+        present, absent: what settings are in a method that names its parts, with this one among
+            them or not, where the method does not say otherwise (`on`, `off`: of the switch).
         kept: dotted names of attributes that a checkpoint holds.
     """
 
     name: ClassVar[str]
     switch: ClassVar[str | None]
     needs: ClassVar[tuple[str, ...]]
-    present: ClassVar[Mapping[str, Any]]
-    absent: ClassVar[Mapping[str, Any]]
+    present: ClassVar[dict[str, Any]]
+    absent: ClassVar[dict[str, Any]]
     kept: ClassVar[tuple[str, ...]]
     #: iteration from which on losses can be compared
     latest: int = 0
 
     def __init_subclass__(
-        cls,
-        name: str,
-        switch: str | None = None,
-        needs: tuple[str, ...] = (),
-        present: Mapping[str, Any] | None = None,
-        absent: Mapping[str, Any] | None = None,
-        kept: tuple[str, ...] = (),
-    ) -> None:
-        cls.name, cls.switch, cls.needs, cls.kept = name, switch, needs, kept
-        cls.present, cls.absent = present or {}, absent or {}
+        cls, switch: str | None = None, on: Any = None, off: Any = None, needs: Sequence[str] = (),
+        present: Mapping[str, Any] | None = None, absent: Mapping[str, Any] | None = None,
+        kept: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        cls.name, cls.switch, cls.needs = cls.__name__.lower(), switch, tuple(needs)
+        cls.kept = tuple(kept)
+        cls.present = dict(present or ({} if on is None else {str(switch): on}))
+        cls.absent = dict(absent or ({} if off is None else {str(switch): off}))
 
     @classmethod
-    def of(cls, start: Start) -> Part | None:
-        """The part of a fit, or None where it has none."""
-        if cls.switch is None or any(getattr(start, name) is None for name in cls.needs):
+    def of(cls, fit: Trainer) -> Part | None:
+        """The part of a fit that is about to begin, or None where it has none."""
+        if cls.switch is None or any(getattr(fit, name) is None for name in cls.needs):
             return None
-        return cls(start) if not cls.switch or getattr(start.settings, cls.switch) else None
+        return cls(fit) if not cls.switch or getattr(fit.settings, cls.switch) else None
 
-    def __init__(self, start: Start) -> None:
-        self.settings = start.settings
+    def __init__(self, fit: Trainer) -> None:
+        self.settings = fit.settings
 
     def begin(self, fit: Trainer) -> None:
         """Before an iteration's view is drawn by lot."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from stages.fit.parts.base import Bools, Indices, Part, Start, Step, logit
+from stages.fit.parts.base import Bools, Indices, Part, Step, logit
 from stages.fit.settings import (
     AutoBool,
     AutoInt,
@@ -27,7 +27,7 @@ SETTLE = 100
 
 
 class Density(
-    Part, name="density", switch="densify", present={"densify": True}, absent={"densify": False},
+    Part, switch="densify", on=True, off=False,
     kept=("statistics.signed", "statistics.absolute", "statistics.seen"),
 ):  # fmt: skip
     """Large gradients on the screen decide on clones and splits.
@@ -63,16 +63,16 @@ class Density(
         prune_opacity: Annotated[float, Field(gt=0, lt=0.5)] = 0.005
         """Gaussians below this opacity are removed"""
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, fit: Trainer) -> None:
         from stages.fit.numerics.density import DensityStatistics
 
-        super().__init__(start)
-        self.statistics = DensityStatistics.empty(len(start.packed))
+        super().__init__(fit)
+        self.statistics = DensityStatistics.empty(len(fit.packed))
 
     @classmethod
-    def of(cls, start: Start) -> Part | None:
+    def of(cls, fit: Trainer) -> Part | None:
         wanted = "mcmc" if cls.name == "mcmc" else "default"
-        return super().of(start) if start.settings.strategy == wanted else None
+        return super().of(fit) if fit.settings.strategy == wanted else None
 
     def due(self, now: int) -> bool:
         s = self.settings
@@ -108,7 +108,7 @@ class Density(
 
 
 class Mcmc(
-    Density, name="mcmc", switch="densify",
+    Density, switch="densify",
     present={"densify": True, "strategy": "mcmc", "opacity_reg": 0.01, "scale_reg": 0.01},
 ):  # fmt: skip
     """The dead move to the living, and noise keeps the positions exploring."""
@@ -134,9 +134,7 @@ class Mcmc(
             fit.replace(*relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random))
 
 
-class Shape(
-    Part, name="isotropic", switch="", present={"isotropic": True}, absent={"isotropic": False}
-):
+class Isotropic(Part, switch="isotropic", on=True, off=False):
     """Opacity and scale have a price, and scales may be kept equal."""
 
     class Settings(PartSettings):
@@ -144,9 +142,9 @@ class Shape(
         """keep the three scales of each Gaussian equal"""
 
     @classmethod
-    def of(cls, start: Start) -> Part | None:
-        s = start.settings
-        return cls(start) if s.isotropic or s.opacity_reg > 0 or s.scale_reg > 0 else None
+    def of(cls, fit: Trainer) -> Part | None:
+        s = fit.settings
+        return cls(fit) if s.isotropic or s.opacity_reg > 0 or s.scale_reg > 0 else None
 
     def guide(self, fit: Trainer, step: Step) -> None:
         from stages.fit.numerics.mcmc import add_regularisers

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.errors import ReconstructionError
-from stages.fit.parts.base import Array, Bools, Figures, Floats, Part, Start, logit
+from stages.fit.parts.base import Array, Bools, Figures, Floats, Part, logit
 from stages.fit.settings import AutoFloat, PartSettings, Weight, automatic
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Floaters(
-    Part, name="floaters", switch="", needs=("scene",),
+    Part, switch="", needs=("scene",),
     absent={"final_prune_contribution": 0.0, "final_prune_near": 0.0, "final_prune_masked": 0.0},
 ):  # fmt: skip
     """What is transparent goes in any case."""
@@ -32,9 +32,9 @@ class Floaters(
         """finally remove Gaussians with less than this share of their area inside the masks: they
         have grown out of them (a held surface has a rim and no needles)"""
 
-    def __init__(self, start: Start) -> None:
-        assert start.scene is not None
-        self.positions, self.removed = start.scene.cloud.positions, 0
+    def __init__(self, fit: Trainer) -> None:
+        assert fit.scene is not None
+        self.positions, self.removed = fit.scene.cloud.positions, 0
 
     def end(self, fit: Trainer) -> None:
         keep = worth_keeping(fit, self.positions)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from stages.fit.parts.base import Bools, Floats, Indices, Part, Start, Step
+from stages.fit.parts.base import Bools, Floats, Indices, Part, Step
 from stages.fit.parts.objectives import Variation
 from stages.fit.settings import (
     AutoFloat,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Light(
-    Part, name="light", switch="light", present={"light": "camera"}, absent={"light": "none"},
+    Part, switch="light", on="camera", off="none",
     kept=("model.material", "model.values", "model.first", "model.second", "model.adam.first",
           "model.adam.second", "model.adam.steps"),
 ):  # fmt: skip
@@ -80,21 +80,21 @@ class Light(
         """on a held surface there is a light if its shading lowers the error of predicting the
         photographs from one another to this share"""
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, fit: Trainer) -> None:
         from stages.fit.numerics.lens_light import LensLight, initial_material
 
-        scene, cloud = start.scene, start.cloud
+        scene, cloud = fit.scene, fit.cloud
         assert scene is not None and cloud is not None
         images = [view.image for view in scene.views]
         masks = [view.valid() for view in scene.views]
         material = initial_material(
-            cloud, scene.cloud.positions, images, masks, scene.cameras, start.settings
+            cloud, scene.cloud.positions, images, masks, scene.cameras, fit.settings
         )
-        self.model = LensLight(material, start.settings)
+        self.model = LensLight(material, fit.settings)
 
     @classmethod
-    def of(cls, start: Start) -> Part | None:
-        return super().of(start) if start.lit else None
+    def of(cls, fit: Trainer) -> Part | None:
+        return super().of(fit) if fit.lit else None
 
     def shade(self, packed: Floats, viewpoint: Viewpoint) -> None:
         self.model.shade(packed, viewpoint)

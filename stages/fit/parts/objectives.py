@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from stages.fit.parts.base import Bools, Figures, Indices, Part, Start, Step
+from stages.fit.parts.base import Bools, Figures, Indices, Part, Step
 from stages.fit.settings import AutoFloat, PartSettings, Positive, Weight, automatic
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
 
 
-class Depth(Part, name="depth", switch="lambda_depth", absent={"lambda_depth": 0.0}):
+class Depth(Part, switch="lambda_depth", off=0.0):
     """What is seen lies where the points are."""
 
     class Settings(PartSettings):
@@ -40,16 +40,16 @@ class Depth(Part, name="depth", switch="lambda_depth", absent={"lambda_depth": 0
         return {"lambda_depth": self.settings.lambda_depth}
 
 
-class Flow(Part, name="flow", switch="lambda_flow", absent={"lambda_flow": 0.0}):
+class Flow(Part, switch="lambda_flow", off=0.0):
     """What is seen moves between two views as the photographs do."""
 
     class Settings(PartSettings):
         lambda_flow: Weight = 0.01
         """weight of the flow loss, per pixel of flow error; 0: none"""
 
-    def __init__(self, start: Start) -> None:
-        super().__init__(start)
-        self.pairs = sum(target[1].flow is not None for target in start.targets)
+    def __init__(self, fit: Trainer) -> None:
+        super().__init__(fit)
+        self.pairs = sum(target[1].flow is not None for target in fit.targets)
 
     def ask(self, fit: Trainer, step: Step) -> None:
         step.flow = step.target.flow if fit.iteration % 2 == 1 else None
@@ -72,9 +72,8 @@ class Flow(Part, name="flow", switch="lambda_flow", absent={"lambda_flow": 0.0})
 
 
 class Variation(
-    Part, name="variation", switch="lambda_tv", present={"lambda_tv": 0.2},
-    absent={"lambda_tv": 0.0}, kept=("graph.neighbours", "graph.starts"),
-):  # fmt: skip
+    Part, switch="lambda_tv", on=0.2, off=0.0, kept=("graph.neighbours", "graph.starts")
+):
     """Draws the colours of neighbours together: harmonics, or the albedos that a light shades.
 
     Attributes:
@@ -90,10 +89,10 @@ class Variation(
         tv_tolerance: Positive = 0.02
         """differences of colour below this count by their squares only"""
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, fit: Trainer) -> None:
         from stages.fit.numerics.total_variation import TotalVariation
 
-        s = start.settings
+        s = fit.settings
         self.graph = TotalVariation(s.lambda_tv, s.tv_neighbours, s.tv_tolerance)
 
     def guide(self, fit: Trainer, step: Step) -> None:

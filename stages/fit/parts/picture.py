@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stages.fit.parts.base import Floats, Part, Start, Step
+from stages.fit.parts.base import Floats, Part, Step
 from stages.fit.settings import AUTO, AutoColour, PartSettings, Positive, Weight, automatic
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
 
 
-class Backdrop(
-    Part, name="background", switch="", absent={"background": (0.0, 0.0, 0.0)},
+class Background(
+    Part, switch="", absent={"background": (0.0, 0.0, 0.0)},
     kept=("colour.values", "colour.moments", "colour.steps"),
 ):  # fmt: skip
     """What no Gaussian stands before still has a colour: a dark throat, a cheek out of focus.
@@ -34,16 +34,16 @@ class Backdrop(
         background_lr: Weight = 1e-2
         """learning rate of that colour"""
 
-    def __init__(self, start: Start) -> None:
-        from stages.fit.numerics.background import Background
+    def __init__(self, fit: Trainer) -> None:
+        from stages.fit.numerics import background
 
-        given: Any = start.settings.background
+        given: Any = fit.settings.background
         free = given == AUTO
-        whole = all(bool(view[min(view)].colour.mask.all()) for view in start.targets)
+        whole = all(bool(view[min(view)].colour.mask.all()) for view in fit.targets)
         # a view that is still to be placed must not find what is missing painted behind
-        learned = free and whole and not start.settings.progressive
+        learned = free and whole and not fit.settings.progressive
         values: Sequence[float] = (0.0, 0.0, 0.0) if free else given
-        self.colour = Background(values, learned, start.settings.background_lr)
+        self.colour = background.Background(values, learned, fit.settings.background_lr)
 
     def show(self, view: int | None, image: Floats, transmittance: Floats) -> Floats:
         return self.colour.behind(image, transmittance)
@@ -52,10 +52,7 @@ class Backdrop(
         self.colour.step(step.d_planes[:3], step.rendering.transmittance, step.d_transmittance)
 
 
-class Exposure(
-    Part, name="exposure", switch="exposure", present={"exposure": True},
-    absent={"exposure": False}, kept=("values", "moments"),
-):  # fmt: skip
+class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "moments")):
     """A gain and a bias per view and channel, so that exposure does not become geometry.
 
     Adam on them; their means over the views stay 1 and 0.
@@ -72,9 +69,9 @@ class Exposure(
         exposure_lr: Positive = 1e-3
         """learning rate of exposure"""
 
-    def __init__(self, start: Start) -> None:
-        super().__init__(start)
-        self.values = np.tile(np.array([[1.0], [0.0]]), (len(start.poses), 1, 3))
+    def __init__(self, fit: Trainer) -> None:
+        super().__init__(fit)
+        self.values = np.tile(np.array([[1.0], [0.0]]), (len(fit.targets), 1, 3))
         self.moments = np.zeros((2, *self.values.shape))
         self.before: Floats = np.empty((3, 0, 0), np.float32)
 

@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
 
 
-class Poses(
-    Part, name="poses", switch="optimize_poses", present={"optimize_poses": True},
-    absent={"optimize_poses": False},
-):  # fmt: skip
+class Poses(Part, switch="optimize_poses", on=True, off=False):
     """Camera poses are refined with the Gaussians."""
 
     class Settings(PartSettings):
@@ -40,10 +37,7 @@ class Poses(
             fit.poses.step(step.flow.to, step.gradients.next_pose, rate)
 
 
-class Focal(
-    Part, name="focal", switch="optimize_focal", present={"optimize_focal": True},
-    absent={"optimize_focal": False},
-):  # fmt: skip
+class Focal(Part, switch="optimize_focal", on=True, off=False):
     """The focal length is refined, by one factor that all views share."""
 
     class Settings(PartSettings):

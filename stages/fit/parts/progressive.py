@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.geometry.order import viewing_order
-from stages.fit.parts.base import Array, Floats, Part, Start, interpolate
+from stages.fit.parts.base import Array, Floats, Part, interpolate
+from stages.fit.parts.poses import PoseOptimizer
 from stages.fit.settings import Count, PartSettings, Positive
 
 if TYPE_CHECKING:
@@ -39,9 +40,8 @@ UNCOVERED = 0.5
 
 
 class Progressive(
-    Part, name="progressive", switch="progressive", needs=("scene",),
-    present={"progressive": True}, absent={"progressive": False}, kept=("placed", "latest"),
-):  # fmt: skip
+    Part, switch="progressive", on=True, off=False, needs=("scene",), kept=("placed", "latest")
+):
     """Which frames take part yet, and how the next one is added.
 
     Attributes:
@@ -63,26 +63,26 @@ class Progressive(
         progressive_pose_lr_final: Positive = 3e-5
         """progressive: and at the last one"""
 
-    def __init__(self, start: Start) -> None:
-        """From here on `start` knows of the first frame only.
+    def __init__(self, fit: Trainer) -> None:
+        """From here on the fit knows of the first frame only.
 
         Lenses, order and depth come from the scene's cameras; of the poses, only the first one's.
         """
         from stages.fit.initial import thin
 
-        super().__init__(start)
-        assert start.scene is not None
-        self.cameras = start.scene.cameras
+        super().__init__(fit)
+        assert fit.scene is not None
+        self.cameras = fit.scene.cameras
         self.order = viewing_order(np.array([camera.centre for camera in self.cameras]))
         self.clouds = [
-            thin(seen_by(view, camera, start.scene.cloud.positions), self.settings.initial_points)
-            for view, camera in zip(start.scene.views, self.cameras, strict=True)
+            thin(seen_by(view, camera, fit.scene.cloud.positions), self.settings.initial_points)
+            for view, camera in zip(fit.scene.views, self.cameras, strict=True)
         ]
         self.placed = 1
-        start.held = self.order[0]
-        first = start.poses[start.held]
-        start.packed = self._gaussians(start.held, first)
-        start.poses = np.repeat(first[None], len(start.poses), 0)
+        held = self.order[0]
+        first = fit.poses.poses[held]
+        fit.packed = self._gaussians(held, first)
+        fit.poses = PoseOptimizer(np.repeat(first[None], len(self.order), 0), held)
 
     def begin(self, fit: Trainer) -> None:
         """Place the frames that are due before the next iteration."""

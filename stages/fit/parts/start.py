@@ -10,7 +10,7 @@ from stages.fit.parts.base import Part
 from stages.fit.settings import AutoFloat, Count, PartSettings, Positive, Share, automatic
 
 
-class Filling(Part, name="filling", absent={"trusted_confidence": 1.0, "fill_share": 1.0}):
+class Filling(Part, absent={"trusted_confidence": 1.0, "fill_share": 1.0}):
     """Points that were measured count for more than points that were filled in."""
 
     class Settings(PartSettings):
@@ -25,7 +25,7 @@ class Filling(Part, name="filling", absent={"trusted_confidence": 1.0, "fill_sha
         what was not measured grows better from what was"""
 
 
-class Shading(Part, name="shading", absent={"normal_neighbours": 0, "headlight": 0.0}):
+class Shading(Part, absent={"normal_neighbours": 0, "headlight": 0.0}):
     """Harmonics start as a matte surface is lit from the camera."""
 
     class Settings(PartSettings):
@@ -35,7 +35,7 @@ class Shading(Part, name="shading", absent={"normal_neighbours": 0, "headlight":
         """share of the light that comes from the camera, to start degree 1 from normals"""
 
 
-class Saturation(Part, name="saturation", absent={"saturation": 2.0}):  # above any colour
+class Saturation(Part, absent={"saturation": 2.0}):  # above any colour
     """What is white in a photograph may be brighter still."""
 
     class Settings(PartSettings):
@@ -43,7 +43,7 @@ class Saturation(Part, name="saturation", absent={"saturation": 2.0}):  # above 
         """photographs are white from here on: a rendering may be brighter there without penalty"""
 
 
-class Coarse(Part, name="coarse", absent={"coarse_fraction": 0.0}):
+class Coarse(Part, absent={"coarse_fraction": 0.0}):
     """Images are small at first."""
 
     class Settings(PartSettings):

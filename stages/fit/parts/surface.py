@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import Field
 
-from stages.fit.parts.base import Array, Bools, Indices, Part, Start, Step
+from stages.fit.parts.base import Array, Bools, Indices, Part, Step
 from stages.fit.settings import AutoBool, PartSettings, Share, automatic
 
 if TYPE_CHECKING:
@@ -20,8 +20,8 @@ FEW_VIEWS = 3
 
 
 class Surface(
-    Part, name="surface", switch="hold_surface", needs=("cloud",), present={"hold_surface": True},
-    absent={"hold_surface": False}, kept=("anchors.anchor", "anchors.turn"),
+    Part, switch="hold_surface", on=True, off=False, needs=("cloud",),
+    kept=("anchors.anchor", "anchors.turn"),
 ):  # fmt: skip
     """Attributes:
     anchors: where each Gaussian belongs.
@@ -42,15 +42,15 @@ class Surface(
         hold_colors_until: Share = 0.0
         """up to this share of the iterations, held Gaussians change colour only"""
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, fit: Trainer) -> None:
         from stages.fit.numerics.surface import HeldSurface, along_normals
 
-        s, cloud = start.settings, start.cloud
+        s, cloud = fit.settings, fit.cloud
         assert cloud is not None
         self.until = s.hold_colors_until
-        along_normals(start.packed, cloud.normals, s.hold_flatness)
+        along_normals(fit.packed, cloud.normals, s.hold_flatness)
         self.anchors = HeldSurface(
-            start.packed, cloud.normals, cloud.weight, s.hold_strength, s.hold_growth
+            fit.packed, cloud.normals, cloud.weight, s.hold_strength, s.hold_growth
         )
 
     def still(self, done: float) -> bool:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from stages.fit.parts.base import Bools, Figures, Indices, Part, Start, Step, interpolate
+from stages.fit.parts.base import Bools, Figures, Indices, Part, Step, interpolate
 from stages.fit.parts.light import Light
 from stages.fit.parts.surface import Surface
 from stages.fit.settings import AUTO, AutoFloat, PartSettings, Positive, automatic
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 SLOPE_LIT, SLOPE = 2.0, 0.3
 
 
-class Bending(
-    Part, name="warp", switch="warp_levels", needs=("cloud",), absent={"warp_levels": 0},
+class Warp(
+    Part, switch="warp_levels", off=0, needs=("cloud",),
     kept=("bend.field.coefficients", "bend.field.nodes", "bend.field.offsets", "bend.normals",
           "bend.facing", "bend.shape", "bend.gradient", "bend.adam.first", "bend.adam.second",
           "bend.adam.steps", "bend.collected"),
@@ -49,16 +49,16 @@ class Bending(
         warp_lr_final: AutoFloat = automatic({3: 1e-5}, held=1e-4)
         """learning rate of the splines at the end"""
 
-    def __init__(self, start: Start) -> None:
-        from stages.fit.numerics.warp import Warp
+    def __init__(self, fit: Trainer) -> None:
+        from stages.fit.numerics import warp
 
-        s, scene, cloud = start.settings, start.scene, start.cloud
+        s, scene, cloud = fit.settings, fit.scene, fit.cloud
         assert scene is not None and cloud is not None
         self.rates = s.warp_lr_init, s.warp_lr_final
         pixel = 1 / max(camera.fx for camera in scene.cameras)
-        self.bend = Warp(
+        self.bend = warp.Warp(
             cloud.positions, cloud.normals, max(s.warp_spacing, s.warp_spacing_px * pixel),
-            s.warp_levels, steepest(s, start.lit), len(scene.views),
+            s.warp_levels, steepest(s, fit.lit), len(scene.views),
         )  # fmt: skip
 
     def guide(self, fit: Trainer, step: Step) -> None:
