@@ -26,7 +26,8 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from pipeline.config import load_config, presets
-from stages.fit import parts, trainer
+from stages.fit import trainer
+from stages.fit.config import PARTS as FIT_PARTS
 from stages.fit.config import FitConfig, FitSettings, resolve
 from stages.fit.fitting import fit
 from stages.splatting.adam import Adam
@@ -76,7 +77,7 @@ def watch_the_trainer() -> Clock:
     clock.watch(ColourLoss, "__call__", "loss")
     clock.watch(Adam, "step", "optimiser")
     hooks = {"guide": "optimiser", "follow": "optimiser", "populate": "density"}
-    for kind in parts.PARTS:
+    for kind in FIT_PARTS:
         for hook in hooks.keys() & vars(kind).keys():
             clock.watch(kind, hook, hooks[hook])
     return clock

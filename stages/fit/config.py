@@ -7,17 +7,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline.stage import runtime
-from stages.fit.parts import PARTS
-from stages.fit.parts.density import SETTLE, Density, Isotropic, Mcmc
-from stages.fit.parts.floaters import Floaters
+from stages.fit.parts.base import Part
+from stages.fit.parts.camera import Background, Exposure, Focal, Poses
+from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
-from stages.fit.parts.picture import Background, Exposure
-from stages.fit.parts.poses import Focal, Poses
 from stages.fit.parts.progressive import Progressive
 from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
-from stages.fit.parts.surface import Surface
-from stages.fit.parts.warp import Warp
+from stages.fit.parts.surface import Surface, Warp
 from stages.fit.settings import (
     AUTO,
     AutoFloat,
@@ -31,6 +28,11 @@ from stages.fit.settings import (
     by_rule,
 )
 
+#: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
+PARTS: tuple[type[Part], ...] = (
+    Progressive, Filling, Shading, Saturation, Coarse, Exposure, Background, Depth, Flow, Light,
+    Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters,
+)  # fmt: skip
 PartName = Literal[
     "background", "coarse", "density", "depth", "exposure", "filling", "floaters", "flow", "focal",
     "isotropic", "light", "mcmc", "poses", "progressive", "saturation", "shading", "surface",

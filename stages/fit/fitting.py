@@ -17,8 +17,8 @@ from stages.fit.backend import use_backend
 from stages.fit.config import FitSettings
 from stages.fit.initial import Frame
 from stages.fit.lighting import choose_light, harmonics_for_viewers
+from stages.fit.parts.camera import Background
 from stages.fit.parts.light import Light
-from stages.fit.parts.picture import Background
 from stages.fit.scene import prepare
 from stages.fit.trainer import Trainer
 from stages.splatting.rasterizer import rasterize, unpack, use_threads
@@ -119,10 +119,10 @@ def finished(trainer: Trainer, cameras: Sequence[Camera], frame: Frame) -> Gauss
     if light is not None:
         gaussians = replace(
             unpack(harmonics_for_viewers(trainer, cameras).packed),
-            light=light.model.light(frame.scale),
+            light=light.light(frame.scale),
         )
-    if backdrop is not None and backdrop.colour.values.any():
-        red, green, blue = (float(value) for value in backdrop.colour.values)
+    if backdrop is not None and backdrop.values.any():
+        red, green, blue = (float(value) for value in backdrop.values)
         gaussians = replace(gaussians, background=(red, green, blue))
     means = gaussians.means.astype(np.float64) * frame.scale + frame.centre
     return replace(

@@ -11,8 +11,8 @@ from pipeline.errors import ReconstructionError
 from stages.fit.config import FitSettings
 from stages.fit.initial import facing, headlight_harmonics
 from stages.fit.numerics.evidence import prediction_errors
+from stages.fit.parts.camera import Background, Exposure
 from stages.fit.parts.light import Light
-from stages.fit.parts.picture import Background, Exposure
 from stages.fit.scene import Scene
 from stages.fit.trainer import Trainer
 from stages.splatting.projection import HARMONICS
@@ -96,9 +96,9 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
     part, backdrop, s = trainer.find(Light), trainer.find(Background), trainer.settings
     assert part is not None and backdrop is not None
     positions = trainer.packed[:, :3].astype(np.float64)
-    normals = part.model.normals().astype(np.float64)
+    normals = part.normals().astype(np.float64)
     cosine = facing(positions, normals, cameras)
-    albedo = np.clip(part.model.material[:, :3].astype(np.float64), 0, 1.2)
+    albedo = np.clip(part.material[:, :3].astype(np.float64), 0, 1.2)
     colours = albedo * (1 - s.headlight + s.headlight * cosine)[:, None]
     sh = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
     packed = np.concatenate(
@@ -110,7 +110,7 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         position_lr_final=0.0, rotation_lr=0.0, scaling_lr=0.0, opacity_lr=0.0,
         optimize_poses=False, densify=False, lambda_depth=0.0, lambda_flow=0.0,
         opacity_reset_interval=0, sh_degree_interval=0,
-        background=tuple(backdrop.colour.values.tolist()),
+        background=tuple(backdrop.values.tolist()),
     )  # fmt: skip
     second = Trainer(
         colours_only, np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held,

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from pipeline.errors import ReconstructionError
 from stages.fit.checkpoint import load_checkpoint, save_checkpoint
+from stages.fit.config import PARTS, FitSettings
 from stages.fit.diary import write_curve, write_preview
-from stages.fit.parts import PARTS
 from stages.fit.parts.base import (
     Array,
     Floats,
@@ -24,14 +24,13 @@ from stages.fit.parts.base import (
     restore_state,
     state_of,
 )
-from stages.fit.parts.poses import PoseOptimizer, SharedFocal
+from stages.fit.parts.camera import PoseOptimizer, SharedFocal
 from stages.fit.targets import Target
 from stages.splatting.adam import Adam
 from stages.splatting.projection import HARMONICS
 from stages.splatting.rasterizer import Rendering, Viewpoint, rasterize
 
 if TYPE_CHECKING:
-    from stages.fit.config import FitSettings
     from stages.fit.initial import Cloud
     from stages.fit.scene import Scene
 
@@ -47,7 +46,7 @@ class Trainer:
     """One fit, in a frame where the scene's depth is about 1.
 
     Attributes:
-        parts: what it is made of, in the order of `parts.PARTS`.
+        parts: what it is made of, in the order of `config.PARTS`.
         packed: [N, 11 + 3 K] float32 Gaussians.
         poses: the cameras' optimiser, which holds the poses; focal: that of their focal length.
         rasterize: what steps are taken with (see `backend`).

@@ -12,10 +12,8 @@ from stages.fit.config import FitConfig, resolve
 from stages.fit.initial import Cloud, smooth_normals, thin
 from stages.fit.numerics.density import rotations
 from stages.fit.numerics.mcmc import add_noise, add_regularisers, relocate, shared
-from stages.fit.numerics.surface import HeldSurface, along_normals
-from stages.fit.parts.picture import Background
-from stages.fit.parts.poses import SharedFocal
-from stages.fit.parts.surface import worth_holding
+from stages.fit.parts.camera import Background, SharedFocal
+from stages.fit.parts.surface import Surface, worth_holding
 from stages.fit.scene import out_of_place, trusted_points
 from stages.fit.targets import Target, make_target
 
@@ -92,19 +90,21 @@ def test_gaussians_lie_along_their_normals_and_are_held_there() -> None:
     normals[:3] = [[0, 0, 1], [0, 0, -1], [0, 0, 0]]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(length > 0, length, 1)
-    along_normals(packed, normals, 0.25)
+    confidence = np.full(300, 10.0)
+    confidence[150:] = 1.0
+    cloud = Cloud(packed[:, :3].astype(float), np.zeros((300, 3)), normals, confidence)
+    settings = FitConfig(hold_flatness=0.25, hold_strength=0.5, hold_growth=3.0)
+    fit = SimpleNamespace(settings=settings, cloud=cloud, packed=packed)
+    held = Surface(fit)
     known = np.abs(normals).sum(1) > 0
     axes = rotations(packed[:, 3:7])[:, :, 2]
     assert np.allclose(axes[known], normals[known], atol=1e-5)
     assert np.allclose(np.exp(packed[known, 9]), 0.0125) and packed[2, 9] == packed[2, 7]
-    confidence = np.full(300, 10.0)
-    confidence[150:] = 1.0
-    held = HeldSurface(packed, normals, confidence, 0.5, 3.0)
     start = packed.copy()
     packed[:, :3] += rng.normal(size=(300, 3)).astype(np.float32)
     packed[7, 7:10] = np.log(0.5)
     moved = packed.copy()
-    held.pull(packed)
+    held.follow(fit, None)
     assert np.allclose(packed[7, 7:9], np.log(0.15))  # no needle
     off = ((moved - start)[:, :3] * normals).sum(1)
     left = ((packed - start)[:, :3] * normals).sum(1)
@@ -217,18 +217,22 @@ def test_the_background_is_found_where_nothing_is_masked_out() -> None:
 
     empty, clear = np.zeros((3, 12, 16), np.float32), np.ones((12, 16), np.float32)
 
+    def step_towards(background: Background, shown: np.ndarray) -> None:
+        gradient, drawn = whole.colour(shown, 0.0).gradient, SimpleNamespace(transmittance=clear)
+        step = SimpleNamespace(d_planes=gradient, rendering=drawn, d_transmittance=0 * clear)
+        background.compare(None, step)
+
     found = behind([{1: whole}])
     for _ in range(200):
-        shown = found.show(0, empty, clear)
-        found.colour.step(whole.colour(shown, 0.0).gradient, clear)
-    assert found.colour.values == pytest.approx(0.5, abs=0.03)
+        step_towards(found, found.show(0, empty, clear))
+    assert found.values == pytest.approx(0.5, abs=0.03)
     again = behind([{1: whole}])
     again.restore(found.arrays())
-    assert again.colour.steps == 200 and np.array_equal(again.colour.values, found.colour.values)
+    assert again.steps == 200 and np.array_equal(again.values, found.values)
 
     black = behind([{1: whole}, {1: masked}])
-    black.colour.step(whole.colour(empty, 0.0).gradient, clear)
-    assert not black.colour.values.any()
+    step_towards(black, empty)
+    assert not black.values.any()
     fixed = behind([{1: whole}], background=(0.2, 0.3, 0.4))
-    fixed.colour.step(whole.colour(empty, 0.0).gradient, clear)
-    assert fixed.colour.values.tolist() == [0.2, 0.3, 0.4]
+    step_towards(fixed, empty)
+    assert fixed.values.tolist() == [0.2, 0.3, 0.4]

@@ -8,8 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.config import Config, load_config, result_fields
-from stages.fit.config import FitConfig, FitSettings, PartName, resolve
-from stages.fit.parts import PARTS
+from stages.fit.config import PARTS, FitConfig, FitSettings, PartName, resolve
 from stages.fit.stage import FitStage
 from tests.stages.test_fit_trainer import case, context
 

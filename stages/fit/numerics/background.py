@@ -1,8 +1,6 @@
-"""The colour behind everything, found with the Gaussians."""
+"""An image laid over the colour that is behind everything, and the gradients of that."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -46,52 +44,19 @@ def _pull_back(  # type: ignore[no-untyped-def]
         sums[y, 2] = blue
 
 
-class Background:
-    """One sRGB colour, and Adam on it.
+def behind(image: Floats, transmittance: Floats, colour: Array) -> Floats:
+    """[3, H, W] an image laid over a colour [3] through what it lets pass, [H, W]."""
+    result = np.empty(image.shape, np.float32)
+    with KERNELS:
+        _lay_over(image, transmittance, colour.astype(np.float32), result)
+    return result
 
-    Attributes:
-        values: [3] float64 in 0..1.
-        learned: whether it is found by the fit, or given; rate: of learning.
-    """
 
-    def __init__(self, values: Sequence[float], learned: bool, rate: float) -> None:
-        self.values = np.array(values, np.float64)
-        self.learned = learned
-        self.rate = rate
-        self.moments = np.zeros((2, 3))
-        self.steps = 0
-
-    def behind(self, image: Floats, transmittance: Floats) -> Floats:
-        """[3, H, W] an image laid over the background through what it lets pass, [H, W]."""
-        if not self.values.any():
-            return image
-        result = np.empty(image.shape, np.float32)
-        with KERNELS:
-            _lay_over(image, transmittance, self.values.astype(np.float32), result)
-        return result
-
-    def step(
-        self, d_image: Floats, transmittance: Floats, d_transmittance: Floats | None = None
-    ) -> None:
-        """Move the colour against the gradient [3, H, W] of an image laid over it.
-
-        What that gradient says of the transmittance is added to `d_transmittance` [H, W].
-        """
-        if not (self.learned or self.values.any()):
-            return
-        sums = np.empty((len(transmittance), 3))
-        if d_transmittance is None:
-            d_transmittance = np.zeros_like(transmittance)
-        with KERNELS:
-            _pull_back(
-                d_image, transmittance, self.values.astype(np.float32), d_transmittance, sums
-            )
-        if not self.learned:
-            return
-        gradient = sums.sum(0)
-        self.steps += 1
-        self.moments[0] = 0.9 * self.moments[0] + 0.1 * gradient
-        self.moments[1] = 0.99 * self.moments[1] + 0.01 * gradient**2
-        mean = self.moments[0] / (1 - 0.9**self.steps)
-        spread = np.sqrt(self.moments[1] / (1 - 0.99**self.steps))
-        self.values = np.clip(self.values - self.rate * mean / (spread + 1e-15), 0, 1)
+def pulled_back(
+    d_image: Floats, transmittance: Floats, colour: Array, d_transmittance: Floats
+) -> Array:
+    """[3] gradient of the colour; that of the transmittance is added to `d_transmittance`."""
+    sums = np.empty((len(transmittance), 3))
+    with KERNELS:
+        _pull_back(d_image, transmittance, colour.astype(np.float32), d_transmittance, sums)
+    return np.asarray(sums.sum(0))

@@ -36,7 +36,6 @@ def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _pull(packed: Floats, anchor: Floats, turn: Floats):  # type: ignore[no-untyped-def]
-    """`HeldSurface.pull`; arrays as it has them."""
     for i in prange(len(packed)):
         firmness, widest = anchor[i, 7], anchor[i, 8]
         off = F(0)
@@ -51,52 +50,13 @@ def _pull(packed: Floats, anchor: Floats, turn: Floats):  # type: ignore[no-unty
             packed[i, k] = min(packed[i, k], widest)
 
 
-class HeldSurface:
-    """Where each Gaussian belongs, and how firmly.
+def pull(packed: Floats, anchor: Floats, turn: Floats) -> None:
+    """Draw Gaussians [N, D] back onto their surface: position, turn, thickness; bound the width.
 
-    Attributes:
-        anchor: [N, 9] float32: position, normal (0: free), log of the thickness, firmness 0..1, log
-            of the largest width.
-        turn: [N, 4] float32 quaternion to be kept.
+    Args:
+        anchor: [N, 9] position, normal (0: free), log of the thickness, firmness 0..1, log of the
+            largest width.
+        turn: [N, 4] quaternions to be kept.
     """
-
-    def __init__(
-        self, packed: Floats, normals: Array, confidence: Array, strength: float, growth: float
-    ) -> None:
-        """
-        Args:
-            packed: [N, D] Gaussians as they start.
-            normals: [N, 3] unit, or 0.
-            confidence: [N], raw, >= 1; the median of those above 1.5 is sure.
-            strength: share of the way back that a sure Gaussian goes after each step, 0..1.
-            growth: by which factor Gaussians may get wider than they start.
-        """
-        measured = confidence[confidence > 1.5]
-        sure = float(np.median(measured)) if len(measured) else 2.0
-        firmness = np.clip((confidence - 1) / (sure - 1), 0, 1) * strength
-        firmness = firmness * (np.abs(normals).sum(1) > 0)
-        widest = packed[:, 7:9].max(1, keepdims=True) + np.log(growth)
-        columns = [packed[:, :3], normals, packed[:, 9:10], firmness[:, None], widest]
-        self.anchor: Floats = np.concatenate(columns, 1).astype(np.float32)
-        self.turn: Floats = packed[:, 3:7].copy()
-
-    def follow(self, move: Floats, normals: Floats) -> None:
-        """Go with a surface that has bent.
-
-        Args:
-            move: [N, 3] by how much its points have moved.
-            normals: [N, 3] unit, or 0: what they face now.
-        """
-        self.turn = turned(self.turn, self.anchor[:, 3:6], normals)
-        self.anchor[:, :3] += move
-        self.anchor[:, 3:6] = normals
-
-    def pull(self, packed: Floats) -> None:
-        """Draw Gaussians back onto their surface: position, turn, thickness; bound the width."""
-        with KERNELS:
-            _pull(packed, self.anchor, self.turn)
-
-    def select(self, source: npt.NDArray[np.int64]) -> None:
-        """Rows follow those of the packed scene."""
-        self.anchor = np.ascontiguousarray(self.anchor[source])
-        self.turn = np.ascontiguousarray(self.turn[source])
+    with KERNELS:
+        _pull(packed, anchor, turn)

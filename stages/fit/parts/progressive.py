@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.geometry.order import viewing_order
 from stages.fit.parts.base import Array, Floats, Part, interpolate
-from stages.fit.parts.poses import PoseOptimizer
+from stages.fit.parts.camera import PoseOptimizer
 from stages.fit.settings import Count, PartSettings, Positive
 
 if TYPE_CHECKING:
