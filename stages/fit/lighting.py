@@ -10,7 +10,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.errors import ReconstructionError
 from stages.fit.config import FitSettings
 from stages.fit.initial import facing, headlight_harmonics
-from stages.fit.numerics.evidence import prediction_errors
+from stages.fit.numerics.light import prediction_errors
 from stages.fit.parts.camera import Background, Exposure
 from stages.fit.parts.light import Light
 from stages.fit.scene import Scene
@@ -73,7 +73,8 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
         except ReconstructionError:  # it diverged; if the fit does as well, it says so
             scores[name] = 0.0
             continue
-        image = trainer.picture(camera.cam_from_world[:3], target)
+        viewpoint = trainer.viewpoint(camera.cam_from_world[:3], target)
+        image = trainer.composited(None, trainer.look(viewpoint))
         scores[name] = target.colour(np.clip(image, 0, 1), settings.lambda_dssim).psnr
     better = scores["camera"] >= scores["none"] + settings.light_margin
     figures = {f"light_trial_{name}": round(score, 2) for name, score in scores.items()}

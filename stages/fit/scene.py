@@ -6,20 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.flow import Flow
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
+from stages.fit.arrays import Array, Bools, Floats
 from stages.fit.config import FitSettings
 from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
-from stages.fit.parts.base import Array, Floats
 from stages.fit.targets import Target, make_pyramids, point_depth
 from stages.fit.trainer import Trainer
 
-Bools = npt.NDArray[np.bool_]
-Flows = dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]
+Flows = dict[int, tuple[int, Floats, Bools]]
 
 #: scene extent: this times the largest distance of a camera from their middle (3DGS), at least
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
@@ -41,7 +39,6 @@ class Scene:
     cloud: all points, in the frame.
     trusted: [N] which of them were measured, not filled in.
     frame: of the fit, in the world.
-    flows: view -> (another view, flow to it, mask).
     targets: per view, factor -> what the fit compares with.
     """
 
@@ -50,7 +47,6 @@ class Scene:
     cloud: Cloud
     trusted: Bools
     frame: Frame
-    flows: Flows
     targets: list[dict[int, Target]]
 
     def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
@@ -89,13 +85,12 @@ class Scene:
         )
 
     def without(self, view: int) -> Scene:
-        """All views but one (and no flow)."""
+        """All views but one."""
         rest = [index for index in range(len(self.views)) if index != view]
         return replace(
             self,
             views=tuple(self.views[index] for index in rest),
             cameras=tuple(self.cameras[index] for index in rest),
-            flows={},
             targets=[self.targets[index] for index in rest],
         )
 
@@ -130,7 +125,7 @@ def prepare(
         [view.image for view in views], [view.valid() for view in views], local, sorted(factors),
         cloud.positions[trusted] if settings.lambda_depth > 0 else None, flows,
     )  # fmt: skip
-    return Scene(tuple(views), local, cloud, trusted, frame, flows, targets)
+    return Scene(tuple(views), local, cloud, trusted, frame, targets)
 
 
 def trusted_points(cloud: Cloud, confidence: float) -> Bools:
@@ -170,12 +165,10 @@ def in_frame(camera: Camera, frame: Frame) -> Camera:
     return replace(camera, cam_from_world=matrix)
 
 
-def chosen_flows(
-    views: Sequence[View], flow: Flow | None
-) -> dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]:
+def chosen_flows(views: Sequence[View], flow: Flow | None) -> Flows:
     """For each placed view its flow to another placed one: (index of that, flow, mask)."""
     index = {view.name: position for position, view in enumerate(views)}
-    chosen: dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]] = {}
+    chosen: Flows = {}
     for pair in flow.pairs if flow is not None else ():
         i, j = index.get(pair.name_i), index.get(pair.name_j)
         if i is None or j is None or i in chosen or not pair.mask_forward.any():

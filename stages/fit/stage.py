@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from typing import ClassVar
 
 from pipeline.artifacts.cameras import Cameras
@@ -74,14 +75,9 @@ class FitStage(Stage):
         if result.backend_note:
             context.warn(result.backend_note)
         refined = {camera.name: camera for camera in result.cameras}
+        every = tuple(refined.get(camera.name, camera) for camera in cameras.cameras)
         context.save(result.gaussians)
-        context.save(
-            Cameras(
-                tuple(refined.get(camera.name, camera) for camera in cameras.cameras),
-                cameras.input_from_world,
-                cameras.units,
-            )
-        )
+        context.save(replace(cameras, cameras=every))
         if settings.preview_every > 0:
             pictures = context.output("pictures")
             for path in sorted(diary.iterdir()):

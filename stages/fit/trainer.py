@@ -9,22 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.errors import ReconstructionError
-from stages.fit.checkpoint import load_checkpoint, save_checkpoint
+from stages.fit.arrays import Array, Bools, Floats, Indices
 from stages.fit.config import PARTS, FitSettings
-from stages.fit.diary import write_curve, write_preview
-from stages.fit.parts.base import (
-    Array,
-    Floats,
-    Part,
-    Step,
-    interpolate,
-    restore_state,
-    state_of,
-)
+from stages.fit.parts.base import Part, Step, interpolate, restore_state, state_of
 from stages.fit.parts.camera import PoseOptimizer, SharedFocal
+from stages.fit.records import load_checkpoint, save_checkpoint, write_curve, write_preview
 from stages.fit.targets import Target
 from stages.splatting.adam import Adam
 from stages.splatting.projection import HARMONICS
@@ -190,9 +181,7 @@ class Trainer:
             self.packed = np.pad(self.packed[:, :used], ((0, 0), (0, max(0, missing))))
             self.adam.resize(used)
 
-    def replace(
-        self, packed: Floats, source: npt.NDArray[np.int64], fresh: npt.NDArray[np.bool_]
-    ) -> None:
+    def replace(self, packed: Floats, source: Indices, fresh: Bools) -> None:
         """Put other rows in place; the optimiser's rows and the parts follow `source`."""
         self.packed = packed
         self.adam.select(source, fresh)
@@ -203,16 +192,11 @@ class Trainer:
         """The part of a kind, if the fit has it."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
-    def viewpoint(self, view: int, target: Target) -> Viewpoint:
-        return self._viewpoint(self.poses.poses[view], target)
-
-    def _viewpoint(self, pose: Array, target: Target) -> Viewpoint:
+    def viewpoint(self, view: int | Array, target: Target) -> Viewpoint:
+        """Where a view, or a camera of another pose [3, 4], sees a target from."""
+        pose = view if isinstance(view, np.ndarray) else self.poses.poses[view]
         local, intrinsics = np.ascontiguousarray(pose, np.float32), target.intrinsics
         return Viewpoint(local, self.focal.apply(intrinsics), target.width, target.height)
-
-    def picture(self, pose: Array, target: Target) -> Floats:
-        """[3, H, W] what a camera that is none of the fit's sees, without exposure."""
-        return self.composited(None, self.look(self._viewpoint(pose, target)))
 
     def render(self, view: int, factor: int = 1) -> Rendering:
         """A view as the Gaussians stand now, colour only."""
@@ -313,7 +297,7 @@ class Trainer:
     def _fingerprint(self) -> str:
         """What this fit is, and no other."""
         # how often a checkpoint is written says nothing about what is in it
-        constants = self.settings.but(checkpoint_every=1)
+        constants = self.settings.model_copy(update={"checkpoint_every": 1})
         sizes = [sorted(target) for target in self.targets]
         content = hashlib.sha256(repr((constants, self.extent, self.poses.held, sizes)).encode())
         states = [state_of(self, ("packed", "poses.poses")), *(p.arrays() for p in self.parts)]

@@ -10,8 +10,7 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from stages.fit.config import FitConfig, resolve
 from stages.fit.initial import Cloud, smooth_normals, thin
-from stages.fit.numerics.density import rotations
-from stages.fit.numerics.mcmc import add_noise, add_regularisers, relocate, shared
+from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
 from stages.fit.parts.camera import Background, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
 from stages.fit.scene import out_of_place, trusted_points

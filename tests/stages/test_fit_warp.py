@@ -13,7 +13,7 @@ from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from stages.fit.numerics.spline_field import SplineField
-from stages.fit.numerics.warp import Warp, turned
+from stages.fit.numerics.surface import Warp, turned
 from stages.fit.stage import FitStage
 from tests.stages.test_fit_light import bump, case, context, lit_image
 

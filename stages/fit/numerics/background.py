@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
+from stages.fit.arrays import Array, Floats
 from stages.splatting.threads import KERNELS
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

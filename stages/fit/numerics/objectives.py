@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
+from stages.fit.arrays import Array, Floats
 from stages.splatting.rasterizer import Rendering
 from stages.splatting.threads import KERNELS
 
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
 F = np.float32
 
 #: where less light than this is stopped, depth and flow are of what lies behind as well
@@ -23,7 +21,7 @@ SMOOTH = F(1e-8)
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _compare_depth(  # type: ignore[no-untyped-def]
-    plane: Floats, transmittance: Floats, depth: Floats, sums: Doubles
+    plane: Floats, transmittance: Floats, depth: Floats, sums: Array
 ):
     """Number of pixels and sum of the absolute errors into `sums` [H, 2], row by row."""
     height, width = depth.shape
@@ -71,7 +69,7 @@ def depth_loss(
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _compare_flow(  # type: ignore[no-untyped-def]
-    planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, sums: Doubles
+    planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, sums: Array
 ):
     """Number of pixels and sum of the lengths of the errors into `sums` [H, 2], row by row."""
     height, width = mask.shape

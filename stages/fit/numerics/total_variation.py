@@ -9,10 +9,10 @@ variation over a graph of neighbours (Rudin, Osher and Fatemi 1992), rounded off
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 from scipy.spatial import cKDTree
 
+from stages.fit.arrays import Floats, Integers
 from stages.splatting.lane_types import WIDTH
 from stages.splatting.lanes import (
     at_least,
@@ -25,8 +25,6 @@ from stages.splatting.lanes import (
 )
 from stages.splatting.threads import KERNELS
 
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int32]
 F = np.float32
 CHUNK = 256
 

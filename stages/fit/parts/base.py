@@ -11,55 +11,38 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
+
+from stages.fit.arrays import Array, Arrays, Bools, Floats, Indices
 
 if TYPE_CHECKING:
     from stages.fit.targets import FlowTarget, Target
     from stages.fit.trainer import Trainer
     from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
-Arrays = dict[str, npt.NDArray[Any]]
 Figures = dict[str, float | int | str]
 
 
 @dataclass
 class Step:
-    """One iteration: a view, and what parts make of it.
+    """One iteration: a view, and what parts make of it."""
 
-    Attributes:
-        view: index of the view; factor: its images are reduced by; target, viewpoint: so reduced.
-        done: share of the fit that is over, 0..1.
-        depth: a plane of depth is drawn too.
-        flow, following: what a plane of flow is compared with, and the view that it leads to.
-        rendering: of the view.
-        loss, psnr: of the image.
-        d_planes, d_transmittance: gradients by what was drawn.
-        gradients: by the Gaussians and by the camera.
-        by_pose: [6] gradient by the camera's twist.
-        rates: [D] learning rate of each column.
-    """
-
-    view: int
-    factor: int
+    view: int  # its index
+    factor: int  # by which its images are reduced
     target: Target
     viewpoint: Viewpoint
-    done: float
-    depth: bool = False
-    flow: FlowTarget | None = None
-    following: Viewpoint | None = None
+    done: float  # share of the fit that is over, 0..1
+    depth: bool = False  # a plane of depth is drawn too
+    flow: FlowTarget | None = None  # what a plane of flow is compared with
+    following: Viewpoint | None = None  # the view that it leads to
     loss: float = 0.0
     psnr: float = 0.0
     # there from when it is drawn, compared, and stepped
     rendering: Rendering = field(init=False)
-    d_planes: Floats = field(init=False)
+    d_planes: Floats = field(init=False)  # gradients by what was drawn
     d_transmittance: Floats = field(init=False)
-    gradients: Gradients = field(init=False)
-    by_pose: Array = field(init=False)
-    rates: Floats = field(init=False)
+    gradients: Gradients = field(init=False)  # by the Gaussians and by the camera
+    by_pose: Array = field(init=False)  # [6] by the camera's twist
+    rates: Floats = field(init=False)  # [D] learning rate of each column
 
 
 class Part:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.geometry.rigid import moved_by
-from stages.fit.parts.base import Array, Floats, Part, Step, interpolate
+from stages.fit import numerics
+from stages.fit.arrays import Array, Floats
+from stages.fit.parts.base import Part, Step, interpolate
 from stages.fit.settings import (
     AUTO,
     AutoColour,
@@ -54,16 +56,16 @@ class Background(
         self.moments, self.steps = np.zeros((2, 3)), 0
 
     def show(self, view: int | None, image: Floats, transmittance: Floats) -> Floats:
-        from stages.fit.numerics.background import behind
-
-        return behind(image, transmittance, self.values) if self.values.any() else image
+        return (
+            numerics.background.behind(image, transmittance, self.values)
+            if self.values.any()
+            else image
+        )
 
     def compare(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.background import pulled_back
-
         if not (self.learned or self.values.any()):
             return
-        gradient = pulled_back(
+        gradient = numerics.background.pulled_back(
             step.d_planes[:3], step.rendering.transmittance, self.values, step.d_transmittance
         )
         if not self.learned:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from pipeline.errors import ReconstructionError
-from stages.fit.parts.base import Array, Bools, Figures, Floats, Indices, Part, Step, logit
+from stages.fit import numerics
+from stages.fit.arrays import AnyArray, Array, Bools, Floats, Indices
+from stages.fit.parts.base import Figures, Part, Step, logit
 from stages.fit.settings import (
     AutoBool,
     AutoFloat,
@@ -69,10 +70,8 @@ class Density(
         """Gaussians below this opacity are removed"""
 
     def __init__(self, fit: Trainer) -> None:
-        from stages.fit.numerics.density import DensityStatistics
-
         super().__init__(fit)
-        self.statistics = DensityStatistics.empty(len(fit.packed))
+        self.statistics = numerics.density.DensityStatistics.empty(len(fit.packed))
 
     @classmethod
     def of(cls, fit: Trainer) -> Part | None:
@@ -85,8 +84,6 @@ class Density(
         return within and now % s.densification_interval == 0
 
     def populate(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.density import choose, grow
-
         s = self.settings
         self.statistics.add(
             step.gradients.centres, step.gradients.absolute, step.rendering.visible,
@@ -94,14 +91,14 @@ class Density(
         )  # fmt: skip
         if self.due(fit.iteration):
             largest = np.exp(fit.packed[:, 7:10]).max(1)
-            clone, split = choose(
+            clone, split = numerics.density.choose(
                 self.statistics, largest, small=s.percent_dense * fit.extent, absgrad=s.absgrad,
                 grad_threshold=s.densify_grad_threshold,
                 abs_grad_threshold=s.densify_abs_grad_threshold,
                 room=s.max_gaussians - len(fit.packed),
             )  # fmt: skip
             keep = fit.packed[:, 10] > logit(s.prune_opacity)
-            fit.replace(*grow(fit.packed, clone, split, keep, fit.random))
+            fit.replace(*numerics.density.grow(fit.packed, clone, split, keep, fit.random))
         if s.opacity_reset_interval > 0 and fit.iteration % s.opacity_reset_interval == 0:
             ceiling = np.float32(logit(2 * s.prune_opacity))
             fit.packed[:, 10] = np.minimum(fit.packed[:, 10], ceiling)
@@ -127,16 +124,16 @@ class Mcmc(
         """weight of the mean scale in the loss (mcmc: 0.01)"""
 
     def follow(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.mcmc import add_noise
-
-        add_noise(fit.packed, self.settings.noise_lr * float(step.rates[0]), fit.random)
+        numerics.density.add_noise(
+            fit.packed, self.settings.noise_lr * float(step.rates[0]), fit.random
+        )
 
     def populate(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.mcmc import relocate
-
         s = self.settings
         if self.due(fit.iteration):
-            fit.replace(*relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random))
+            fit.replace(
+                *numerics.density.relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random)
+            )
 
 
 class Isotropic(Part, switch="isotropic", on=True, off=False):
@@ -152,10 +149,8 @@ class Isotropic(Part, switch="isotropic", on=True, off=False):
         return cls(fit) if s.isotropic or s.opacity_reg > 0 or s.scale_reg > 0 else None
 
     def guide(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.mcmc import add_regularisers
-
         s, gradient = self.settings, step.gradients.packed
-        add_regularisers(fit.packed, gradient, s.opacity_reg, s.scale_reg)
+        numerics.density.add_regularisers(fit.packed, gradient, s.opacity_reg, s.scale_reg)
         if s.isotropic:
             gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
 
@@ -217,7 +212,7 @@ def contribution(rendering: Rendering, mask: Floats) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(areas[:, 0]), np.ascontiguousarray(areas[:, 1])
 
 
-def in_picture(points: npt.NDArray[Any], viewpoint: Viewpoint) -> tuple[Any, Bools]:
+def in_picture(points: AnyArray, viewpoint: Viewpoint) -> tuple[Any, Bools]:
     """[N] depths of points [N, 3] in a view, and which of them its image shows."""
     turn = viewpoint.pose[:, :3].T.astype(points.dtype)
     local = points @ turn + viewpoint.pose[:, 3]

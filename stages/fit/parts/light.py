@@ -8,7 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.artifacts import gaussians as artifacts
-from stages.fit.parts.base import Array, Bools, Floats, Indices, Part, Step
+from stages.fit import numerics
+from stages.fit.arrays import Array, Bools, Floats, Indices
+from stages.fit.parts.base import Part, Step
 from stages.fit.parts.objectives import Variation
 from stages.fit.settings import (
     AutoFloat,
@@ -93,7 +95,6 @@ class Light(
         photographs from one another to this share"""
 
     def __init__(self, fit: Trainer) -> None:
-        from stages.fit.numerics.material import initial_material
         from stages.splatting.adam import Adam
 
         super().__init__(fit)
@@ -101,7 +102,7 @@ class Light(
         assert scene is not None and cloud is not None
         images = [view.image for view in scene.views]
         masks = [view.valid() for view in scene.views]
-        self.material = initial_material(
+        self.material = numerics.light.initial_material(
             cloud, scene.cloud.positions, images, masks, scene.cameras, s
         )
         self.values = np.array(

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from stages.fit.parts.base import Bools, Figures, Indices, Part, Step
+from stages.fit import numerics
+from stages.fit.arrays import Bools, Indices
+from stages.fit.parts.base import Figures, Part, Step
 from stages.fit.settings import AutoFloat, PartSettings, Positive, Weight, automatic
 
 if TYPE_CHECKING:
@@ -28,11 +30,9 @@ class Depth(Part, switch="lambda_depth", off=0.0):
         step.depth = fit.iteration % 2 == 0 and bool(step.target.depth.any())
 
     def compare(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.objectives import depth_loss
-
         if step.depth:
             weight = 2 * self.settings.lambda_depth
-            step.loss += weight * depth_loss(
+            step.loss += weight * numerics.objectives.depth_loss(
                 step.rendering, step.target.depth, weight, step.d_planes[3], step.d_transmittance
             )
 
@@ -58,11 +58,9 @@ class Flow(Part, switch="lambda_flow", off=0.0):
             step.following = fit.viewpoint(step.flow.to, there)
 
     def compare(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.objectives import flow_loss
-
         if step.flow is not None:
             weight = 2 * self.settings.lambda_flow
-            step.loss += weight * flow_loss(
+            step.loss += weight * numerics.objectives.flow_loss(
                 step.rendering.planes[3:], step.rendering.transmittance, step.flow.flow,
                 step.flow.mask, weight, step.d_planes[3:], step.d_transmittance,
             )  # fmt: skip
@@ -90,10 +88,10 @@ class Variation(
         """differences of colour below this count by their squares only"""
 
     def __init__(self, fit: Trainer) -> None:
-        from stages.fit.numerics.total_variation import TotalVariation
-
         s = fit.settings
-        self.graph = TotalVariation(s.lambda_tv, s.tv_neighbours, s.tv_tolerance)
+        self.graph = numerics.total_variation.TotalVariation(
+            s.lambda_tv, s.tv_neighbours, s.tv_tolerance
+        )
 
     def guide(self, fit: Trainer, step: Step) -> None:
         from stages.splatting.harmonics import C0

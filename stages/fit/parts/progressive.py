@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.geometry.order import viewing_order
-from stages.fit.parts.base import Array, Floats, Part, interpolate
+from stages.fit.arrays import Array, Floats
+from stages.fit.parts.base import Part, interpolate
 from stages.fit.parts.camera import PoseOptimizer
 from stages.fit.settings import Count, PartSettings, Positive
 

@@ -1,6 +1,6 @@
 """The surface of the input points: Gaussians are held to it, and it bends as a whole.
 
-See `numerics.surface` and `numerics.warp`.
+See `numerics.surface`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from stages.fit.parts.base import Array, Bools, Figures, Floats, Indices, Part, Step, interpolate
+from stages.fit import numerics
+from stages.fit.arrays import Array, Bools, Floats, Indices
+from stages.fit.parts.base import Figures, Part, Step, interpolate
 from stages.fit.parts.light import Light
 from stages.fit.settings import (
     AUTO,
@@ -59,12 +61,10 @@ class Surface(
         """up to this share of the iterations, held Gaussians change colour only"""
 
     def __init__(self, fit: Trainer) -> None:
-        from stages.fit.numerics.surface import along_normals
-
         super().__init__(fit)
         s, cloud, packed = self.settings, fit.cloud, fit.packed
         assert cloud is not None
-        along_normals(packed, cloud.normals, s.hold_flatness)
+        numerics.surface.along_normals(packed, cloud.normals, s.hold_flatness)
         # the median of what was measured is sure
         measured = cloud.weight[cloud.weight > 1.5]
         sure = float(np.median(measured)) if len(measured) else 2.0
@@ -84,15 +84,11 @@ class Surface(
             step.rates[:11] = 0
 
     def follow(self, fit: Trainer, step: Step) -> None:
-        from stages.fit.numerics.surface import pull
-
-        pull(fit.packed, self.anchor, self.turn)
+        numerics.surface.pull(fit.packed, self.anchor, self.turn)
 
     def bend(self, move: Floats, normals: Floats) -> None:
         """Go with a surface whose points have moved by [N, 3] and face [N, 3] (unit, or 0) now."""
-        from stages.fit.numerics.warp import turned
-
-        self.turn = turned(self.turn, self.anchor[:, 3:6], normals)
+        self.turn = numerics.surface.turned(self.turn, self.anchor[:, 3:6], normals)
         self.anchor[:, :3] += move
         self.anchor[:, 3:6] = normals
 
@@ -132,21 +128,17 @@ class Warp(
         """learning rate of the splines at the end"""
 
     def __init__(self, fit: Trainer) -> None:
-        from stages.fit.numerics import warp
-
         s, scene, cloud = fit.settings, fit.scene, fit.cloud
         assert scene is not None and cloud is not None
         self.rates = s.warp_lr_init, s.warp_lr_final
         pixel = 1 / max(camera.fx for camera in scene.cameras)
-        self.bend = warp.Warp(
+        self.bend = numerics.surface.Warp(
             cloud.positions, cloud.normals, max(s.warp_spacing, s.warp_spacing_px * pixel),
             s.warp_levels, steepest(s, fit.lit), len(scene.views),
         )  # fmt: skip
 
     def guide(self, fit: Trainer, step: Step) -> None:
         """Let the surface as a whole follow the gradients of the Gaussians on it."""
-        from stages.fit.numerics.warp import turned
-
         light, surface, bend = fit.find(Light), fit.find(Surface), self.bend
         if surface is not None and surface.still(step.done):
             return
@@ -157,7 +149,7 @@ class Warp(
         if bent is None:
             return
         fit.packed[:, :3] += bent.move
-        fit.packed[:, 3:7] = turned(fit.packed[:, 3:7], before, bend.facing)
+        fit.packed[:, 3:7] = numerics.surface.turned(fit.packed[:, 3:7], before, bend.facing)
         if light is not None:
             light.material[:, 3:] += bent.lean
         if surface is not None:
