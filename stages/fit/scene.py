@@ -23,8 +23,6 @@ Flows = dict[int, tuple[int, Floats, Bools]]
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
 EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
-
-
 #: where fewer of the points than this share are trusted, confidence means something else
 MIN_TRUSTED = 0.02
 #: surfaces are looked up at this fraction of the image size: measured points are not everywhere

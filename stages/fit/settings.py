@@ -61,8 +61,8 @@ def _told(views: Mapping[int, Any], held: Any) -> str:
     (first, least), *others = views.items()
     words = [f"{least} up to {first} views" if others else f"{least}"]
     words += [f"{value} at {count}" for count, value in others[:-1]]
-    between = "the nearer one" if isinstance(least, bool) else "in proportion"
-    words += [f"{value} from {count}, {between} between them" for count, value in others[-1:]]
+    between = "" if isinstance(least, bool) else ", in proportion between them"
+    words += [f"{value} from {count}{between}" for count, value in others[-1:]]
     return ", ".join(words) + ("" if held is None else f"; {held} on a held surface")
 
 

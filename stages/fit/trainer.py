@@ -168,10 +168,8 @@ class Trainer:
 
     def degree(self) -> int:
         """Degree of the harmonics now: all of them, or one more every interval."""
-        s, every = self.settings, self.settings.sh_degree_interval
-        if self.lit:
-            return 0
-        return s.sh_degree if every <= 0 else min(s.sh_degree, self.iteration // every)
+        every, most = self.settings.sh_degree_interval, 0 if self.lit else self.settings.sh_degree
+        return most if every <= 0 else min(most, self.iteration // every)
 
     def _use_harmonics(self) -> None:
         """Keep what the degree needs by now."""
@@ -297,7 +295,7 @@ class Trainer:
     def _fingerprint(self) -> str:
         """What this fit is, and no other."""
         # how often a checkpoint is written says nothing about what is in it
-        constants = self.settings.model_copy(update={"checkpoint_every": 1})
+        constants = self.settings.but(checkpoint_every=1)
         sizes = [sorted(target) for target in self.targets]
         content = hashlib.sha256(repr((constants, self.extent, self.poses.held, sizes)).encode())
         states = [state_of(self, ("packed", "poses.poses")), *(p.arrays() for p in self.parts)]

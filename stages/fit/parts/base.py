@@ -62,10 +62,10 @@ class Part:
 
     name: ClassVar[str]
     switch: ClassVar[str | None]
-    needs: ClassVar[tuple[str, ...]]
+    needs: ClassVar[Sequence[str]]
     present: ClassVar[dict[str, Any]]
     absent: ClassVar[dict[str, Any]]
-    kept: ClassVar[tuple[str, ...]]
+    kept: ClassVar[Sequence[str]]
     #: iteration from which on losses can be compared
     latest: int = 0
 
@@ -74,8 +74,7 @@ class Part:
         present: Mapping[str, Any] | None = None, absent: Mapping[str, Any] | None = None,
         kept: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        cls.name, cls.switch, cls.needs = cls.__name__.lower(), switch, tuple(needs)
-        cls.kept = tuple(kept)
+        cls.name, cls.switch, cls.needs, cls.kept = cls.__name__.lower(), switch, needs, kept
         cls.present = dict(present or ({} if on is None else {str(switch): on}))
         cls.absent = dict(absent or ({} if off is None else {str(switch): off}))
 

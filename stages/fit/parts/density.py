@@ -43,8 +43,8 @@ class Density(
     """
 
     class Settings(PartSettings):
-        densify: AutoBool = automatic({3: False, 6: True})
-        """clone and split Gaussians"""
+        densify: AutoBool = automatic({5: False, 6: True})
+        """clone and split Gaussians: few views overfit by it"""
         strategy: Literal["default", "mcmc"] = "default"
         """densify by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"""
         absgrad: Literal["split", "both", "off"] = "split"
