@@ -27,9 +27,9 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from pipeline.config import load_config, presets
 from stages.fit import trainer
-from stages.fit.density import DensityStatistics
+from stages.fit.config import PARTS as FIT_PARTS
+from stages.fit.config import FitConfig, FitSettings, resolve
 from stages.fit.fitting import fit
-from stages.fit.settings import FitSettings, resolve
 from stages.splatting.adam import Adam
 from stages.splatting.loss import ColourLoss
 from stages.splatting.rasterizer import Rendering
@@ -75,10 +75,11 @@ def watch_the_trainer() -> Clock:
     # the losses with what it takes to put them together
     clock.watch(trainer.Trainer, "_compare", "loss")
     clock.watch(ColourLoss, "__call__", "loss")
-    clock.watch(trainer.Trainer, "_step_gaussians", "optimiser")
     clock.watch(Adam, "step", "optimiser")
-    clock.watch(DensityStatistics, "add", "density")
-    clock.watch(trainer.Trainer, "_control_density", "density")
+    hooks = {"guide": "optimiser", "follow": "optimiser", "populate": "density"}
+    for kind in FIT_PARTS:
+        for hook in hooks.keys() & vars(kind).keys():
+            clock.watch(kind, hook, hooks[hook])
     return clock
 
 
@@ -117,7 +118,8 @@ def settings_of(preset: str, held: bool, iterations: int | None, views: int) -> 
         return None
     overrides = {} if iterations is None else {"fit.iterations": iterations}
     config = load_config(preset, overrides).sections["fit"]
-    return resolve(config.model_dump(), views, seed=0, held=held)
+    assert isinstance(config, FitConfig)
+    return resolve(config, views, seed=0, held=held)
 
 
 def main() -> None:
@@ -155,7 +157,7 @@ def main() -> None:
         print(
             f"{name}: {settings.iterations:,} iterations, {len(result.gaussians):,} Gaussians, "
             f"{wall:.1f} s wall, {cpu:.1f} s CPU ({options.threads} threads), "
-            f"training PSNR {result.psnr.mean():.2f} dB"
+            f"training PSNR {result.figures['train_psnr']:.2f} dB"
         )
         # before and after the iterations (trials, preparing, pruning) is in there as well
         split = ", ".join(

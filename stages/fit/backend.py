@@ -88,8 +88,7 @@ def _disagreement(trainer: Trainer) -> str | None:
 
     target = trainer.targets[0][1]
     viewpoint = trainer.viewpoint(0, target)
-    if trainer.light is not None:
-        trainer.light.shade(trainer.packed, viewpoint)
+    trainer.shade(viewpoint)
     last = len(trainer.targets) - 1
     options: dict[str, Any] = {
         "degree": trainer.degree(), "near": trainer.settings.near, "depth": True,

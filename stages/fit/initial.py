@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
+from stages.fit.arrays import AnyArray, Array, Bools, Floats, Indices
 
 SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
 
@@ -32,7 +29,7 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def select(self, index: npt.NDArray[np.bool_]) -> Cloud:
+    def select(self, index: Bools) -> Cloud:
         return Cloud(
             self.positions[index], self.colors[index], self.normals[index], self.weight[index]
         )
@@ -52,7 +49,7 @@ class Frame:
     centre: Array
     scale: float
 
-    def points(self, positions: npt.NDArray[np.floating]) -> Array:
+    def points(self, positions: AnyArray) -> Array:
         """[N, 3] from the world."""
         return (np.asarray(positions, np.float64) - self.centre) / self.scale
 
@@ -95,7 +92,7 @@ def thin(cloud: Cloud, target: int) -> Cloud:
     largest = float(np.linalg.norm(high - low)) or 1.0
     smallest = largest * 1e-5
 
-    def cells(size: float) -> npt.NDArray[np.int64]:
+    def cells(size: float) -> Indices:
         index = np.floor((cloud.positions - origin) / size)
         grid = np.clip(index, 0, 2**20).astype(np.int64)
         return (grid[:, 0] << 42) | (grid[:, 1] << 21) | grid[:, 2]

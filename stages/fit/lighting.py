@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.confidence import MEASURED
 from pipeline.errors import ReconstructionError
+from stages.fit.config import FitSettings
 from stages.fit.initial import facing, headlight_harmonics
-from stages.fit.light_evidence import prediction_errors
+from stages.fit.numerics.light import prediction_errors
+from stages.fit.parts.camera import Background, Exposure
+from stages.fit.parts.light import Light
 from stages.fit.scene import Scene
-from stages.fit.settings import FitSettings
 from stages.fit.trainer import Trainer
 from stages.splatting.kernels.projection import HARMONICS
-
-#: points of less confidence are guesses, even where a held surface is made of them
-MEASURED = 1.5
 
 
 def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
@@ -55,8 +54,8 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
     held = middle_view(scene.cameras)
     rest = scene.without(held)
     factor = settings.light_trial_factor
-    trial = replace(
-        settings, iterations=settings.light_trial_iterations,
+    trial = settings.but(
+        iterations=settings.light_trial_iterations,
         initial_points=settings.light_trial_points,
         coarse_fraction=1.0, coarse_factor=factor,
         lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False, warp_levels=0,
@@ -72,7 +71,8 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
         except ReconstructionError:  # it diverged; if the fit does as well, it says so
             scores[name] = 0.0
             continue
-        image = trainer.picture(camera.cam_from_world[:3], target)
+        viewpoint = trainer.viewpoint(camera.cam_from_world[:3], target)
+        image = trainer.composited(None, trainer.look(viewpoint))
         scores[name] = target.colour(np.clip(image, 0, 1), settings.lambda_dssim).psnr
     better = scores["camera"] >= scores["none"] + settings.light_margin
     figures = {f"light_trial_{name}": round(score, 2) for name, score in scores.items()}
@@ -92,30 +92,32 @@ def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Traine
         trainer: a finished fit with a light.
         cameras: in its frame.
     """
-    light, s = trainer.light, trainer.settings
-    assert light is not None
+    part, backdrop, s = trainer.find(Light), trainer.find(Background), trainer.settings
+    assert part is not None and backdrop is not None
     positions = trainer.packed[:, :3].astype(np.float64)
-    normals = light.normals().astype(np.float64)
+    normals = part.normals().astype(np.float64)
     cosine = facing(positions, normals, cameras)
-    albedo = np.clip(light.material[:, :3].astype(np.float64), 0, 1.2)
+    albedo = np.clip(part.material[:, :3].astype(np.float64), 0, 1.2)
     colours = albedo * (1 - s.headlight + s.headlight * cosine)[:, None]
     sh = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
     packed = np.concatenate(
         [trainer.packed[:, :HARMONICS], sh.reshape(len(sh), -1).astype(np.float32)], 1
     )
-    colours_only = replace(
-        s, iterations=s.light_sh_iterations, coarse_fraction=0.5,
+    colours_only = s.but(
+        iterations=s.light_sh_iterations, coarse_fraction=0.5,
         feature_rest_lr=s.light_sh_rest_lr, position_lr_init=0.0,
         position_lr_final=0.0, rotation_lr=0.0, scaling_lr=0.0, opacity_lr=0.0,
         optimize_poses=False, densify=False, lambda_depth=0.0, lambda_flow=0.0,
         opacity_reset_interval=0, sh_degree_interval=0,
-        background=tuple(trainer.background.values.tolist()),
+        background=tuple(backdrop.values.tolist()),
     )  # fmt: skip
     second = Trainer(
-        np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held, trainer.targets,
-        trainer.extent, colours_only,
+        colours_only, np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held,
+        trainer.targets, trainer.extent,
     )  # fmt: skip
-    second.exposure.values = trainer.exposure.values
-    second.variation, second.rasterize = trainer.variation, trainer.rasterize
+    first, exposure = trainer.find(Exposure), second.find(Exposure)
+    if first is not None and exposure is not None:
+        exposure.values = first.values
+    second.rasterize = trainer.rasterize
     second.run(None, lambda *_: None)
     return second

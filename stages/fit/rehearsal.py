@@ -7,10 +7,9 @@ import numpy as np
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
-from stages.fit.config import FitConfig
+from stages.fit.config import FitConfig, resolve
 from stages.fit.fitting import fit
-from stages.fit.objectives import flow_loss
-from stages.fit.settings import resolve
+from stages.fit.numerics.objectives import flow_loss
 from stages.splatting.loss import ColourLoss
 from stages.splatting.rasterizer import Viewpoint, rasterize, use_threads
 
@@ -46,7 +45,7 @@ def whole_fits() -> None:
         )  # fmt: skip
         fit(
             [View(name, _image()) for name in names], cameras, _points(), None,
-            resolve(config.model_dump(), 3, 0, held), threads=1, checkpoint=None,
+            resolve(config, 3, 0, held), threads=1, checkpoint=None,
             report=lambda *_: None,
         )  # fmt: skip
 

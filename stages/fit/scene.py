@@ -6,32 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.flow import Flow
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
+from stages.fit.arrays import Array, Bools, Floats
+from stages.fit.config import FitSettings
 from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
-from stages.fit.lens_light import LensLight, initial_material
-from stages.fit.progressive import Progressive
-from stages.fit.settings import FitSettings
-from stages.fit.surface import HeldSurface, along_normals
 from stages.fit.targets import Target, make_pyramids, point_depth
 from stages.fit.trainer import Trainer
-from stages.fit.warp import Warp
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
-Flows = dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]
+Flows = dict[int, tuple[int, Floats, Bools]]
 
 #: scene extent: this times the largest distance of a camera from their middle (3DGS), at least
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
 EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
-
-
 #: where fewer of the points than this share are trusted, confidence means something else
 MIN_TRUSTED = 0.02
 #: surfaces are looked up at this fraction of the image size: measured points are not everywhere
@@ -46,7 +37,6 @@ class Scene:
     cloud: all points, in the frame.
     trusted: [N] which of them were measured, not filled in.
     frame: of the fit, in the world.
-    flows: view -> (another view, flow to it, mask).
     targets: per view, factor -> what the fit compares with.
     """
 
@@ -55,59 +45,21 @@ class Scene:
     cloud: Cloud
     trusted: Bools
     frame: Frame
-    flows: Flows
     targets: list[dict[int, Target]]
 
     def trainer(self, settings: FitSettings, lit: bool) -> Trainer:
         """A fit of the scene from its points, with a light beside the lens or with harmonics."""
-        if settings.progressive:
-            return self._one_after_another(settings)
-        thinned = self.start(settings)
-        packed = initial_gaussians(
-            thinned, self.cameras, opacity=settings.initial_opacity,
-            scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
-            degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
-        )  # fmt: skip
-        light = None
-        if lit:
-            images = [view.image for view in self.views]
-            masks = [view.valid() for view in self.views]
-            light = LensLight(
-                initial_material(
-                    thinned, self.cloud.positions, images, masks, self.cameras, settings
-                ),
-                settings,
-            )
-        held_surface = None
-        if settings.hold_surface:
-            along_normals(packed, thinned.normals, settings.hold_flatness)
-            held_surface = HeldSurface(
-                packed, thinned.normals, thinned.weight, settings.hold_strength,
-                settings.hold_growth,
-            )  # fmt: skip
-        warp = None
-        if settings.warp_levels:
-            pixel = 1 / max(camera.fx for camera in self.cameras)
-            spacing = max(settings.warp_spacing, settings.warp_spacing_px * pixel)
-            warp = Warp(
-                thinned.positions, thinned.normals, spacing, settings.warp_levels,
-                settings.steepest(lit), len(self.views),
+        cloud, packed = None, np.empty((0, 14), np.float32)
+        if not settings.progressive:
+            cloud = self.start(settings)
+            packed = initial_gaussians(
+                cloud, self.cameras, opacity=settings.initial_opacity,
+                scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
+                degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
             )  # fmt: skip
         extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])
-        return Trainer(
-            packed, poses, middle, self.targets, extent, settings, light, held_surface, warp
-        )  # fmt: skip
-
-    def _one_after_another(self, settings: FitSettings) -> Trainer:
-        """A fit that begins with one view and places the others itself."""
-        progressive = Progressive(self.views, self.cameras, self.cloud.positions, settings)
-        first = progressive.order[0]
-        poses = np.repeat(self.cameras[first].cam_from_world[None, :3], len(self.cameras), 0)
-        return Trainer(
-            progressive.first_gaussians(), poses, first, self.targets, self.extent()[0], settings,
-            progressive=progressive,
-        )  # fmt: skip
+        return Trainer(settings, packed, poses, middle, self.targets, extent, lit, self, cloud)
 
     def extent(self) -> tuple[float, int]:
         """Size of the scene that the position rate is relative to, and the view in the middle."""
@@ -131,13 +83,12 @@ class Scene:
         )
 
     def without(self, view: int) -> Scene:
-        """All views but one (and no flow)."""
+        """All views but one."""
         rest = [index for index in range(len(self.views)) if index != view]
         return replace(
             self,
             views=tuple(self.views[index] for index in rest),
             cameras=tuple(self.cameras[index] for index in rest),
-            flows={},
             targets=[self.targets[index] for index in rest],
         )
 
@@ -172,7 +123,7 @@ def prepare(
         [view.image for view in views], [view.valid() for view in views], local, sorted(factors),
         cloud.positions[trusted] if settings.lambda_depth > 0 else None, flows,
     )  # fmt: skip
-    return Scene(tuple(views), local, cloud, trusted, frame, flows, targets)
+    return Scene(tuple(views), local, cloud, trusted, frame, targets)
 
 
 def trusted_points(cloud: Cloud, confidence: float) -> Bools:
@@ -212,12 +163,10 @@ def in_frame(camera: Camera, frame: Frame) -> Camera:
     return replace(camera, cam_from_world=matrix)
 
 
-def chosen_flows(
-    views: Sequence[View], flow: Flow | None
-) -> dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]]:
+def chosen_flows(views: Sequence[View], flow: Flow | None) -> Flows:
     """For each placed view its flow to another placed one: (index of that, flow, mask)."""
     index = {view.name: position for position, view in enumerate(views)}
-    chosen: dict[int, tuple[int, Floats, npt.NDArray[np.bool_]]] = {}
+    chosen: Flows = {}
     for pair in flow.pairs if flow is not None else ():
         i, j = index.get(pair.name_i), index.get(pair.name_j)
         if i is None or j is None or i in chosen or not pair.mask_forward.any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from pipeline.artifacts.cameras import Cameras
@@ -11,14 +12,14 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Parts, Stage, StageConfig, StageContext
-from stages.fit.config import FitConfig
+from stages.fit.config import FitConfig, resolve
 
 
 class FitStage(Stage):
     """views + cameras + points (+ flow) -> gaussians + refined cameras."""
 
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
     summary: ClassVar[str] = "optimise Gaussians and camera poses against the photographs"
     Config: ClassVar[type[StageConfig]] = FitConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras", "points")
@@ -48,8 +49,7 @@ class FitStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from stages.fit.fitting import fit
-        from stages.fit.settings import resolve
-        from stages.fit.surface import worth_holding
+        from stages.fit.parts.surface import worth_holding
 
         views: Views = context.load("views")
         cameras: Cameras = context.load("cameras")
@@ -72,7 +72,7 @@ class FitStage(Stage):
         held = worth_holding(
             placed_cameras, points.positions.astype(float), context.config.hold_min_angle
         )
-        settings = resolve(context.config.model_dump(), len(placed), context.seed, held)
+        settings = resolve(context.config, len(placed), context.seed, held)
 
         def report(iteration: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}
@@ -89,33 +89,12 @@ class FitStage(Stage):
         if result.backend_note:
             context.warn(result.backend_note)
         refined = {camera.name: camera for camera in result.cameras}
+        every = tuple(refined.get(camera.name, camera) for camera in cameras.cameras)
         context.save(result.gaussians)
-        context.save(
-            Cameras(
-                tuple(refined.get(camera.name, camera) for camera in cameras.cameras),
-                cameras.input_from_world,
-                cameras.units,
-            )
-        )
+        context.save(replace(cameras, cameras=every))
         if settings.preview_every > 0:
             pictures = context.output("pictures")
             for path in sorted(diary.iterdir()):
                 if path.suffix in (".csv", ".png"):
                     shutil.copyfile(path, pictures / path.name)
-        context.summarize(
-            gaussians=len(result.gaussians),
-            iterations=settings.iterations,
-            backend=result.backend,
-            light=result.light,
-            surface_held=str(result.surface_held),
-            surface_bent=round(result.surface_bent, 5),
-            **result.light_figures,
-            train_psnr=round(float(result.psnr.mean()), 3),
-            train_ssim=round(float(result.ssim.mean()), 4),
-            pruned_at_end=result.pruned,
-            densify=str(settings.densify),
-            feature_lr=settings.feature_lr,
-            scaling_lr=settings.scaling_lr,
-            lambda_depth=settings.lambda_depth,
-            flow_pairs=result.flow_pairs,
-        )
+        context.summarize(**result.figures)

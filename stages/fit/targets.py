@@ -7,13 +7,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from stages.fit.arrays import Array, Bools, Floats
 from stages.splatting.loss import ColourLoss
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def point_depth(
 
 def make_target(
     image: Floats,
-    valid: npt.NDArray[np.bool_],
+    valid: Bools,
     camera: Camera,
     factor: int,
     positions: Array | None,
@@ -104,9 +101,7 @@ def make_target(
     return Target(width, height, intrinsics, ColourLoss(planar, np.ascontiguousarray(mask)), depth)
 
 
-def make_flow_target(
-    flow: Floats, mask: npt.NDArray[np.bool_], to: int, target: Target
-) -> FlowTarget:
+def make_flow_target(flow: Floats, mask: Bools, to: int, target: Target) -> FlowTarget:
     """Flow [H, W, 2] and its mask at a target's size."""
     height, width = flow.shape[:2]
     size = (target.width, target.height)
@@ -122,11 +117,11 @@ def make_flow_target(
 
 def make_pyramids(
     images: Sequence[Floats],
-    masks: Sequence[npt.NDArray[np.bool_]],
+    masks: Sequence[Bools],
     cameras: Sequence[Camera],
     factors: Sequence[int],
     positions: Array | None,
-    flows: Mapping[int, tuple[int, Floats, npt.NDArray[np.bool_]]],
+    flows: Mapping[int, tuple[int, Floats, Bools]],
 ) -> list[dict[int, Target]]:
     """For each view, factor -> target; `flows` maps a view to (next view, flow, mask)."""
     pyramids = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.fit.floaters import before_lens, contribution
+from stages.fit.parts.density import before_lens, contribution
 from stages.splatting.rasterizer import Viewpoint, pack, rasterize
 
 VIEW = Viewpoint(

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
-from stages.fit.background import Background
-from stages.fit.config import FitConfig
-from stages.fit.density import rotations
+from stages.fit.config import FitConfig, resolve
 from stages.fit.initial import Cloud, smooth_normals, thin
-from stages.fit.mcmc import add_noise, add_regularisers, relocate, shared
-from stages.fit.poses import SharedFocal
+from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
+from stages.fit.parts.camera import Background, SharedFocal
+from stages.fit.parts.surface import Surface, worth_holding
 from stages.fit.scene import out_of_place, trusted_points
-from stages.fit.settings import resolve
-from stages.fit.surface import HeldSurface, along_normals, worth_holding
-from stages.fit.targets import make_target
+from stages.fit.targets import Target, make_target
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -90,19 +89,21 @@ def test_gaussians_lie_along_their_normals_and_are_held_there() -> None:
     normals[:3] = [[0, 0, 1], [0, 0, -1], [0, 0, 0]]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(length > 0, length, 1)
-    along_normals(packed, normals, 0.25)
+    confidence = np.full(300, 10.0)
+    confidence[150:] = 1.0
+    cloud = Cloud(packed[:, :3].astype(float), np.zeros((300, 3)), normals, confidence)
+    settings = FitConfig(hold_flatness=0.25, hold_strength=0.5, hold_growth=3.0)
+    fit = SimpleNamespace(settings=settings, cloud=cloud, packed=packed)
+    held = Surface(fit)
     known = np.abs(normals).sum(1) > 0
     axes = rotations(packed[:, 3:7])[:, :, 2]
     assert np.allclose(axes[known], normals[known], atol=1e-5)
     assert np.allclose(np.exp(packed[known, 9]), 0.0125) and packed[2, 9] == packed[2, 7]
-    confidence = np.full(300, 10.0)
-    confidence[150:] = 1.0
-    held = HeldSurface(packed, normals, confidence, 0.5, 3.0)
     start = packed.copy()
     packed[:, :3] += rng.normal(size=(300, 3)).astype(np.float32)
     packed[7, 7:10] = np.log(0.5)
     moved = packed.copy()
-    held.pull(packed)
+    held.follow(fit, None)
     assert np.allclose(packed[7, 7:9], np.log(0.15))  # no needle
     off = ((moved - start)[:, :3] * normals).sum(1)
     left = ((packed - start)[:, :3] * normals).sum(1)
@@ -164,9 +165,6 @@ def test_the_shared_focal_walks_to_where_its_gradient_ends() -> None:
     assert focal.apply(intrinsics)[0] == pytest.approx(104, abs=0.2)
     assert focal.apply(intrinsics)[1] == pytest.approx(124.8, abs=0.3)
     assert focal.apply(intrinsics)[2:].tolist() == [50, 40]
-    other = SharedFocal()
-    other.restore(focal.state())
-    assert other.state() == focal.state()
 
 
 def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
@@ -184,25 +182,25 @@ def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
 
 
 def test_what_a_held_surface_changes_unless_the_user_says_otherwise() -> None:
-    free = resolve(FitConfig().model_dump(), 3, 0)
-    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    free = resolve(FitConfig(), 3, 0)
+    held = resolve(FitConfig(), 3, 0, held=True)
     assert not free.hold_surface and held.hold_surface
     assert held.initial_points > free.initial_points
-    off = resolve(FitConfig(hold_surface=False).model_dump(), 3, 0, held=True)
+    off = resolve(FitConfig(hold_surface=False), 3, 0, held=True)
     assert off == free
-    chosen = resolve(FitConfig(hold_surface=True, sh_degree=0).model_dump(), 3, 0)
+    chosen = resolve(FitConfig(hold_surface=True, sh_degree=0), 3, 0)
     assert chosen.hold_surface and chosen.sh_degree == 0
 
 
 def test_settings_follow_the_number_of_views() -> None:
-    few, many, plenty = (resolve(FitConfig().model_dump(), views, 0) for views in (3, 6, 9))
+    few, many, plenty = (resolve(FitConfig(), views, 0) for views in (3, 6, 9))
     assert few.fill_share > 0 and many.fill_share == plenty.fill_share == 0
     assert (few.densify, many.densify, plenty.densify) == (False, True, True)
     assert (few.sh_degree, many.sh_degree, plenty.sh_degree) == (1, 1, 2)
-    held = resolve(FitConfig().model_dump(), 3, 0, held=True)
+    held = resolve(FitConfig(), 3, 0, held=True)
     assert held.light_strength_lr == 0 < few.light_strength_lr
     assert held.light_strengths[0] < few.light_strengths[0]
-    said = resolve(FitConfig(fill_share=0.5, light_strengths=(1.0, 0.1)).model_dump(), 9, 0)
+    said = resolve(FitConfig(fill_share=0.5, light_strengths=(1.0, 0.1)), 9, 0)
     assert (said.fill_share, said.light_strengths) == (0.5, (1.0, 0.1))
 
 
@@ -211,22 +209,29 @@ def test_the_background_is_found_where_nothing_is_masked_out() -> None:
     image = np.full((12, 16, 3), 0.5, np.float32)
     whole = make_target(image, np.ones((12, 16), bool), camera, 1, None)
     masked = make_target(image, np.arange(12)[:, None] < np.full(16, 6), camera, 1, None)
-    settings = resolve(FitConfig(background_lr=0.02).model_dump(), 3, 0)
+
+    def behind(targets: list[dict[int, Target]], **config) -> Background:
+        settings = resolve(FitConfig(background_lr=0.02, **config), 3, 0)
+        return Background(SimpleNamespace(settings=settings, targets=targets))
+
     empty, clear = np.zeros((3, 12, 16), np.float32), np.ones((12, 16), np.float32)
 
-    background = Background(settings, [{1: whole}])
-    for _ in range(200):
-        shown = background.behind(empty, clear)
-        background.step(whole.colour(shown, 0.0).gradient, clear)
-    assert background.values == pytest.approx(0.5, abs=0.03)
-    again = Background(settings, [{1: whole}])
-    again.restore(background.state())
-    assert again.state() == background.state()
+    def step_towards(background: Background, shown: np.ndarray) -> None:
+        gradient, drawn = whole.colour(shown, 0.0).gradient, SimpleNamespace(transmittance=clear)
+        step = SimpleNamespace(d_planes=gradient, rendering=drawn, d_transmittance=0 * clear)
+        background.compare(None, step)
 
-    black = Background(settings, [{1: whole}, {1: masked}])
-    black.step(whole.colour(empty, 0.0).gradient, clear)
+    found = behind([{1: whole}])
+    for _ in range(200):
+        step_towards(found, found.show(0, empty, clear))
+    assert found.values == pytest.approx(0.5, abs=0.03)
+    again = behind([{1: whole}])
+    again.restore(found.arrays())
+    assert again.steps == 200 and np.array_equal(again.values, found.values)
+
+    black = behind([{1: whole}, {1: masked}])
+    step_towards(black, empty)
     assert not black.values.any()
-    given = FitConfig(background=(0.2, 0.3, 0.4)).model_dump()
-    fixed = Background(resolve(given, 3, 0), [{1: whole}])
-    fixed.step(whole.colour(empty, 0.0).gradient, clear)
+    fixed = behind([{1: whole}], background=(0.2, 0.3, 0.4))
+    step_towards(fixed, empty)
     assert fixed.values.tolist() == [0.2, 0.3, 0.4]

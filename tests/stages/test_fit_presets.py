@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import pytest
+from pydantic import ValidationError
 
-from pipeline.config import Config, load_config
-from stages.fit.settings import resolve
+from pipeline.config import Config, load_config, result_fields
+from stages.fit.config import PARTS, FitConfig, FitSettings, PartName, resolve
 from stages.fit.stage import FitStage
 from tests.stages.test_fit_trainer import case, context
 
@@ -49,6 +50,7 @@ def test_the_paper_adds_to_3dgs_what_it_says() -> None:
         "fit.absgrad",
         "fit.percent_dense",
         "fit.max_gaussians",
+        "fit.parts",
         "fit.optimize_poses",
         "fit.pose_lr_init",
         "fit.pose_lr_final",
@@ -69,15 +71,50 @@ def test_nothing_of_our_own_is_in_the_paper_and_its_baselines(name: str) -> None
     assert fit["saturation"] > 1
     # the same with any number of views: our own schedule does not reach them
     decided = {key for key, value in fit.items() if value == "auto"}
-    light = {"light_albedo_lr", "light_normal_lr", "light_strengths", "light_strength_lr"}
-    assert decided <= light | {"pose_lr_init", "pose_lr_final", "backend"}
-    assert fit["optimize_poses"] is False or not decided & {"pose_lr_init", "pose_lr_final"}
+    missing = [part for part in PARTS if part.name not in fit["parts"]]
+    unused = {name for part in missing for name in part.Settings.model_fields}
+    assert decided <= unused | {"backend"}
     assert ("flow" in config.run.stages) == (fit["lambda_flow"] > 0)
+
+
+def test_a_method_has_the_parts_that_it_names() -> None:
+    assert {part.name for part in PARTS} == set(get_args(PartName))
+    ours, none = FitConfig(), FitConfig(parts=[])
+    assert none.light == "none" and not (none.densify or none.optimize_poses or none.warp_levels)
+    named = FitConfig(parts=["poses", "mcmc"], scale_reg=0.5, light="camera")
+    assert named.optimize_poses and named.densify and named.strategy == "mcmc"
+    assert (named.opacity_reg, named.scale_reg, named.light) == (0.01, 0.5, "camera")
+    assert result_fields(ours) == result_fields(FitConfig(parts="auto"))
+    assert "parts" not in result_fields(none)  # what they come to is in the other settings
+    with pytest.raises(ValidationError, match="parts"):
+        FitConfig(parts=["poses", "light_house"])
+
+
+def test_every_setting_says_what_it_means_and_what_auto_is() -> None:
+    for name, field in FitConfig.model_fields.items():
+        assert field.description, name
+        if field.default == "auto":
+            assert "auto" in field.description, name
+    text = FitConfig.model_fields["initial_points"].description
+    assert text is not None and "15000 up to 3 views, 30000 from 6" in text
+    assert "60000 on a held surface" in text
+
+
+def test_what_auto_comes_to_follows_the_number_of_views_without_steps() -> None:
+    def at(views: int) -> FitSettings:
+        return resolve(FitConfig(), views, 0)
+
+    assert [at(n).iterations for n in (2, 3, 4, 6, 9)] == [400, 400, 600, 1000, 1000]
+    assert [at(n).max_gaussians for n in (3, 5, 6, 12)] == [15000, 45000, 60000, 60000]
+    rates = [at(n).feature_rest_lr for n in range(3, 11)]
+    assert rates == sorted(rates) and rates[3] == 7.5e-4 and rates[-2:] == [2e-3, 2e-3]
+    assert [at(n).sh_degree for n in (6, 7, 8, 9)] == [1, 1, 2, 2]
+    assert [at(n).densify for n in (3, 4, 5, 6)] == [False, False, False, True]
 
 
 def test_rates_of_positions_follow_a_schedule_of_30000_iterations() -> None:
     for name in ("3dgs", "paper", "cf3dgs", "instantsplat"):
-        settings = resolve(load_config(name).sections["fit"].model_dump(), 6, 0)
+        settings = resolve(load_config(name).sections["fit"], 6, 0)
         end = 1.6e-4 * 0.01 ** (settings.iterations / 30000)
         assert settings.position_lr_init == 1.6e-4
         assert settings.position_lr_final == pytest.approx(end, rel=1e-3)

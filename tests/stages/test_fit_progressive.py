@@ -13,8 +13,8 @@ from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import exponential
 from stages.fit.config import FitConfig
 from stages.fit.initial import Cloud, initial_gaussians
-from stages.fit.poses import PoseOptimizer
-from stages.fit.progressive import next_pose
+from stages.fit.parts.camera import PoseOptimizer
+from stages.fit.parts.progressive import next_pose
 from stages.fit.stage import FitStage
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipeline.artifacts.views import View, Views
+from stages.fit.numerics.total_variation import TotalVariation
 from stages.fit.stage import FitStage
-from stages.fit.total_variation import TotalVariation
 from tests.stages.test_fit_light import case, context
 
 WEIGHT, NEIGHBOURS, TOLERANCE, UNIT = 0.7, 5, 0.05, 0.3

@@ -9,12 +9,11 @@ variation over a graph of neighbours (Rudin, Osher and Fatemi 1992), rounded off
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 from scipy.spatial import cKDTree
 
 from pipeline.kernels import inlined, kernel
-from stages.fit.checkpoint import Arrays
+from stages.fit.arrays import Floats, Integers
 from stages.splatting.lanes.types import WIDTH
 from stages.splatting.lanes.vectors import (
     at_least,
@@ -27,8 +26,6 @@ from stages.splatting.lanes.vectors import (
 )
 from stages.splatting.threads import KERNELS
 
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int32]
 F = np.float32
 CHUNK = 256
 
@@ -144,14 +141,3 @@ class TotalVariation:
     def forget(self) -> None:
         """Other Gaussians have taken the place of those that were compared."""
         self.neighbours = None
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        if self.neighbours is None:
-            return {}
-        return {"variation_neighbours": self.neighbours, "variation_starts": self.starts}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take up what `arrays` gave."""
-        self.neighbours = arrays.get("variation_neighbours")
-        self.starts = arrays.get("variation_starts", self.starts)

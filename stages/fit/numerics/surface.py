@@ -1,4 +1,10 @@
-"""Bending the surface as a whole, so that the photographs agree on what lies on it.
+"""Gaussians held to the surface that they start on, in proportion to how sure it is.
+
+From three photographs a fit can explain every pixel with needles and gaps that only the three
+cameras don't see. Where the surface is known, Gaussians start as flat discs along it, and what
+takes them off it is drawn back after every step.
+
+The surface itself may bend as a whole, so that the photographs agree on what lies on it.
 
 Gaussians that each move on their own can't correct a surface: one image always pulls against the
 other, and there are a thousand ways to give in. What all of them within a millimetre or two want
@@ -14,17 +20,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from pipeline.kernels import kernel
-from stages.fit.checkpoint import Arrays
-from stages.fit.spline_field import SplineField
+from stages.fit.arrays import Array, Floats, Indices
+from stages.fit.numerics.spline_field import SplineField
 from stages.splatting.adam import Adam
 from stages.splatting.threads import KERNELS
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 F = np.float32
 
 
@@ -115,35 +118,11 @@ class Warp:
         known = np.abs(self.normals).sum(1) > 0
         return float(np.quantile(np.abs(self.shape[known, 0]), 0.95)) if known.any() else 0.0
 
-    def select(self, source: npt.NDArray[np.int64]) -> None:
+    def select(self, source: Indices) -> None:
         """Rows follow those of the packed scene."""
         self.field.select(source)
         for name in ("normals", "facing", "gradient", "shape"):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[source]))
-
-    def arrays(self) -> Arrays:
-        """The whole state, for a checkpoint."""
-        return {
-            "warp_coefficients": self.field.coefficients,
-            "warp_nodes": self.field.nodes,
-            "warp_offsets": self.field.offsets,
-            "warp_normals": self.normals,
-            "warp_facing": self.facing,
-            "warp_shape": self.shape,
-            "warp_gradient": self.gradient,
-            "warp_first": self.adam.first,
-            "warp_second": self.adam.second,
-            "warp_steps": np.array([self.adam.steps, self.collected]),
-        }
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take up what `arrays` gave."""
-        self.field.coefficients = arrays["warp_coefficients"]
-        self.field.nodes, self.field.offsets = arrays["warp_nodes"], arrays["warp_offsets"]
-        self.normals, self.facing = arrays["warp_normals"], arrays["warp_facing"]
-        self.shape, self.gradient = arrays["warp_shape"], arrays["warp_gradient"]
-        self.adam.first, self.adam.second = arrays["warp_first"], arrays["warp_second"]
-        self.adam.steps, self.collected = (int(n) for n in arrays["warp_steps"])
 
 
 @kernel(parallel=True)
@@ -226,3 +205,46 @@ def turned(quaternions: Floats, first: Floats, second: Floats) -> Floats:
     with KERNELS:
         _turned(*given, result)
     return result
+
+
+def along_normals(packed: Floats, normals: Array, flatness: float) -> None:
+    """Turn Gaussians so that their third axis is the normal, and flatten them along it.
+
+    Args:
+        packed: [N, D], changed in place.
+        normals: [N, 3] unit, 0 where unknown (those stay as they are).
+        flatness: standard deviation along the normal, relative to that across it.
+    """
+    known = np.abs(normals).sum(1) > 0
+    unturned = np.tile(np.array([1, 0, 0, 0], np.float32), (int(known.sum()), 1))
+    ahead = np.tile(np.array([0.0, 0.0, 1.0]), (len(unturned), 1))
+    packed[known, 3:7] = turned(unturned, ahead, normals[known])
+    packed[known, 9] += np.float32(np.log(flatness))
+
+
+@kernel(parallel=True)
+def _pull(packed: Floats, anchor: Floats, turn: Floats):  # type: ignore[no-untyped-def]
+    for i in prange(len(packed)):
+        firmness, widest = anchor[i, 7], anchor[i, 8]
+        off = F(0)
+        for k in range(3):
+            off += (packed[i, k] - anchor[i, k]) * anchor[i, 3 + k]
+        for k in range(3):
+            packed[i, k] -= off * firmness * anchor[i, 3 + k]
+        for k in range(4):
+            packed[i, 3 + k] += firmness * (turn[i, k] - packed[i, 3 + k])
+        packed[i, 9] += firmness * (anchor[i, 6] - packed[i, 9])
+        for k in range(7, 10):
+            packed[i, k] = min(packed[i, k], widest)
+
+
+def pull(packed: Floats, anchor: Floats, turn: Floats) -> None:
+    """Draw Gaussians [N, D] back onto their surface: position, turn, thickness; bound the width.
+
+    Args:
+        anchor: [N, 9] position, normal (0: free), log of the thickness, firmness 0..1, log of the
+            largest width.
+        turn: [N, 4] quaternions to be kept.
+    """
+    with KERNELS:
+        _pull(packed, anchor, turn)

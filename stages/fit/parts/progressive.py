@@ -19,32 +19,30 @@ Departures from the original, nearly all in its favour:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.views import View
 from pipeline.geometry.order import viewing_order
-from stages.fit.initial import Cloud, initial_gaussians, thin
-from stages.fit.objectives import interpolate
-from stages.fit.settings import FitSettings
-from stages.fit.targets import point_depth
+from stages.fit.arrays import Array, Floats
+from stages.fit.parts.base import Part, interpolate
+from stages.fit.parts.camera import PoseOptimizer
+from stages.fit.settings import Count, PartSettings, Positive
 
 if TYPE_CHECKING:
+    from pipeline.artifacts.cameras import Camera
+    from pipeline.artifacts.views import View
+    from stages.fit.initial import Cloud
     from stages.fit.trainer import Trainer
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 
 #: where Gaussians let more light through than this, they don't show what a frame sees
 UNCOVERED = 0.5
 
 
-class Progressive:
+class Progressive(
+    Part, switch="progressive", on=True, off=False, needs=("scene",), kept=("placed", "latest")
+):
     """Which frames take part yet, and how the next one is added.
 
     Attributes:
@@ -53,39 +51,45 @@ class Progressive:
         latest: iteration at which the last of those was added.
     """
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        cameras: Sequence[Camera],
-        positions: Array,
-        settings: FitSettings,
-    ) -> None:
+    class Settings(PartSettings):
+        progressive: bool = False
+        """bring in the views one after another in viewing order, each placed by the Gaussians of
+        those before it (CF-3DGS); of the poses found before, only the first one's is used"""
+        progressive_iterations: Count = 100
+        """progressive: iterations per view until the next one is placed"""
+        progressive_pose_iterations: Count = 300
+        """progressive: steps that place a view, with the Gaussians frozen"""
+        progressive_pose_lr_init: Positive = 3e-3
+        """progressive: learning rate of the pose at the first of these steps"""
+        progressive_pose_lr_final: Positive = 3e-5
+        """progressive: and at the last one"""
+
+    def __init__(self, fit: Trainer) -> None:
+        """From here on the fit knows of the first frame only.
+
+        Lenses, order and depth come from the scene's cameras; of the poses, only the first one's.
         """
-        Args:
-            views: to be placed.
-            cameras: lenses, order and depth come from these; of the poses, only the first one's.
-            positions: [N, 3] points, in the frame of the cameras.
-            settings: all constants.
-        """
-        self.settings = settings
-        self.order = viewing_order(np.array([camera.centre for camera in cameras]))
-        self.cameras = cameras
+        from stages.fit.initial import thin
+
+        super().__init__(fit)
+        assert fit.scene is not None
+        self.cameras = fit.scene.cameras
+        self.order = viewing_order(np.array([camera.centre for camera in self.cameras]))
         self.clouds = [
-            thin(seen_by(view, camera, positions), settings.initial_points)
-            for view, camera in zip(views, cameras, strict=True)
+            thin(seen_by(view, camera, fit.scene.cloud.positions), self.settings.initial_points)
+            for view, camera in zip(fit.scene.views, self.cameras, strict=True)
         ]
-        self.placed, self.latest = 1, 0
+        self.placed = 1
+        held = self.order[0]
+        first = fit.poses.poses[held]
+        fit.packed = self._gaussians(held, first)
+        fit.poses = PoseOptimizer(np.repeat(first[None], len(self.order), 0), held)
 
-    def first_gaussians(self) -> Floats:
-        """Packed Gaussians of the first frame."""
-        first = self.order[0]
-        return self._gaussians(first, self.cameras[first].cam_from_world[:3])
-
-    def advance(self, trainer: Trainer) -> list[int]:
-        """Place the frames that are due before the next iteration; all that take part in it."""
-        while self.placed < self._due(trainer.iteration):
-            self._place(trainer, self.order[self.placed])
-        return self.order[: self.placed]
+    def begin(self, fit: Trainer) -> None:
+        """Place the frames that are due before the next iteration."""
+        while self.placed < self._due(fit.iteration):
+            self._place(fit, self.order[self.placed])
+        fit.views = self.order[: self.placed]
 
     def _due(self, iteration: int) -> int:
         """How many frames take part in the iteration after `iteration`; at the end, all of them."""
@@ -95,38 +99,53 @@ class Progressive:
         interval = min(float(s.progressive_iterations), s.iterations / count)
         return min(count, 1 + int(iteration / interval))
 
-    def _place(self, trainer: Trainer, view: int) -> None:
+    def _place(self, fit: Trainer, view: int) -> None:
         s = self.settings
-        trainer.poses.poses[view] = next_pose(trainer.poses.poses[self.order[: self.placed]])
+        fit.poses.poses[view] = next_pose(fit.poses.poses[self.order[: self.placed]])
         for step in range(s.progressive_pose_iterations):
             done = step / s.progressive_pose_iterations
             rate = interpolate(s.progressive_pose_lr_init, s.progressive_pose_lr_final, done)
-            trainer.find_pose(view, rate, UNCOVERED)
-        self._grow(trainer, view)
+            self._find_pose(fit, view, rate)
+        self._grow(fit, view)
         self.placed += 1
-        self.latest = trainer.iteration
-        trainer.queue = []
+        self.latest = fit.iteration
+        fit.queue = []
 
-    def _grow(self, trainer: Trainer, view: int) -> None:
+    def _find_pose(self, fit: Trainer, view: int, rate: float) -> None:
+        """One step of a view's pose alone, by what the Gaussians cover of its image."""
+        from stages.splatting.rasterizer import rasterize
+
+        s, target = self.settings, fit.targets[view][1]
+        viewpoint = fit.viewpoint(view, target)
+        rendering = rasterize(fit.packed, viewpoint, degree=fit.degree(), near=s.near)
+        colour = target.colour(fit.composited(view, rendering), s.lambda_dssim)
+        d_planes = colour.gradient * (rendering.transmittance <= UNCOVERED)
+        gradients = rendering.backward(d_planes, np.zeros_like(rendering.transmittance))
+        # the frame's origin is in the middle of the scene
+        fit.poses.step(view, gradients.pose, rate, pivot=fit.poses.poses[view][:, 3].copy())
+
+    def _grow(self, fit: Trainer, view: int) -> None:
         """Add the Gaussians of a frame at pixels that those so far leave uncovered."""
-        room = max(self.settings.max_gaussians - len(trainer.packed), 0)
-        transmittance = trainer.render(view).transmittance
+        room = max(self.settings.max_gaussians - len(fit.packed), 0)
+        transmittance = fit.render(view).transmittance
         height, width = transmittance.shape
         pixels, _ = replace(self.cameras[view], cam_from_world=np.eye(4)).project(
             self.clouds[view].positions
         )
         column, row = np.clip(pixels.astype(np.int64), 0, (width - 1, height - 1)).T
         new = np.flatnonzero(transmittance[row, column] > UNCOVERED)[:room]
-        added = self._gaussians(view, trainer.poses.poses[view])[new]
-        count = len(trainer.packed)
-        trainer.replace(
-            np.ascontiguousarray(np.concatenate([trainer.packed, added])),
+        added = self._gaussians(view, fit.poses.poses[view])[new]
+        count = len(fit.packed)
+        fit.replace(
+            np.ascontiguousarray(np.concatenate([fit.packed, added])),
             np.concatenate([np.arange(count), np.zeros(len(added), np.int64)]),
             np.arange(count + len(added)) >= count,
         )
 
     def _gaussians(self, view: int, pose: Array) -> Floats:
         """Packed Gaussians of a frame's points, seen from a pose [3, 4]."""
+        from stages.fit.initial import initial_gaussians
+
         s, cloud = self.settings, self.clouds[view]
         camera = replace(self.cameras[view], cam_from_world=np.vstack([pose, [0, 0, 0, 1]]))
         there = replace(cloud, positions=(cloud.positions - pose[:, 3]) @ pose[:, :3])
@@ -135,19 +154,15 @@ class Progressive:
             scale_max_px=s.initial_scale_max_px, degree=s.sh_degree, headlight=s.headlight,
         )  # fmt: skip
 
-    def state(self) -> list[int]:
-        return [self.placed, self.latest]
-
-    def restore(self, state: Any) -> None:
-        """Take up what `state` gave."""
-        self.placed, self.latest = state
-
 
 def seen_by(view: View, camera: Camera, positions: Array) -> Cloud:
     """The points that a camera sees, one per pixel at most, in its own coordinates.
 
     Their colours are the photograph's; they have no normals.
     """
+    from stages.fit.initial import Cloud
+    from stages.fit.targets import point_depth
+
     depth = point_depth(positions, camera, view.width, view.height)
     seen = (depth > 0) & view.valid()
     local = replace(camera.resized(view.width, view.height), cam_from_world=np.eye(4))

@@ -9,16 +9,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sparse
 from numba import prange
 
 from pipeline.kernels import helper, inlined, kernel
+from stages.fit.arrays import Array, Floats, Indices, Integers
 from stages.splatting.threads import KERNELS
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int32]
 F = np.float32
 
 #: sums over points are taken in so many parts, whatever the number of threads
@@ -151,13 +148,13 @@ class SplineField:
             levels.append(transposed @ levels[-1])
         return np.concatenate(levels)
 
-    def select(self, source: npt.NDArray[np.int64]) -> None:
+    def select(self, source: Indices) -> None:
         """Points follow `source` [N']; the lattices stay."""
         self.nodes = np.ascontiguousarray(self.nodes[source])
         self.offsets = np.ascontiguousarray(self.offsets[source])
 
 
-def _numbered(cells: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Integers]:
+def _numbered(cells: Indices) -> tuple[Indices, Integers]:
     """Distinct cells [M, 3] among [..., 3], in order, and which of them each is [...]."""
     flat = cells.reshape(-1, 3)
     low = flat.min(axis=0)
@@ -175,8 +172,8 @@ def _numbered(cells: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], Inte
 
 
 def _coarser(
-    lattice: npt.NDArray[np.int64],
-) -> tuple[npt.NDArray[np.int64], sparse.csr_matrix]:
+    lattice: Indices,
+) -> tuple[Indices, sparse.csr_matrix]:
     """The cells [C, 3] of twice the size that reach those given [M, 3], and how much [M, C]."""
     # a fine cell lies in one half of a coarse one, and also takes from the neighbour on that side
     own = lattice >> 1

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from pipeline.kernels import kernel
+from stages.fit.arrays import Array, Floats
 from stages.splatting.rasterizer import Rendering
 from stages.splatting.threads import KERNELS
 
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
 F = np.float32
 
 #: where less light than this is stopped, depth and flow are of what lies behind as well
@@ -24,7 +22,7 @@ SMOOTH = F(1e-8)
 
 @kernel(parallel=True)
 def _compare_depth(  # type: ignore[no-untyped-def]
-    plane: Floats, transmittance: Floats, depth: Floats, sums: Doubles
+    plane: Floats, transmittance: Floats, depth: Floats, sums: Array
 ):
     """Number of pixels and sum of the absolute errors into `sums` [H, 2], row by row."""
     height, width = depth.shape
@@ -72,7 +70,7 @@ def depth_loss(
 
 @kernel(parallel=True)
 def _compare_flow(  # type: ignore[no-untyped-def]
-    planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, sums: Doubles
+    planes: Floats, transmittance: Floats, flow: Floats, mask: Floats, sums: Array
 ):
     """Number of pixels and sum of the lengths of the errors into `sums` [H, 2], row by row."""
     height, width = mask.shape
@@ -126,14 +124,3 @@ def flow_loss(
         count = max(float(count), 1.0)
         _pull_to_flow(*given, F(weight / count), d_planes, d_transmittance)
     return float(total) / count
-
-
-def interpolate(start: float, end: float, done: float) -> float:
-    """Exponential from `start` (done = 0) to `end` (done = 1); linear where one of them is 0."""
-    if start <= 0 or end <= 0:
-        return start + (end - start) * done
-    return float(start * (end / start) ** done)
-
-
-def logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))

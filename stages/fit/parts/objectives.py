@@ -1,0 +1,107 @@
+"""Terms of the loss beside colour: depth of the input points, optical flow, total variation.
+
+Depth and flow take turns, each twice as heavy: they change slowly, and cost planes that are drawn.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from stages.fit import numerics
+from stages.fit.arrays import Bools, Indices
+from stages.fit.parts.base import Figures, Part, Step
+from stages.fit.settings import AutoFloat, PartSettings, Positive, Weight, automatic
+
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+
+class Depth(Part, switch="lambda_depth", off=0.0):
+    """What is seen lies where the points are."""
+
+    class Settings(PartSettings):
+        lambda_depth: AutoFloat = automatic({3: 0.5, 6: 0.3}, held=0.0)
+        """weight of the depth prior from the input points, in units of the scene's depth; 0:
+        none"""
+
+    def ask(self, fit: Trainer, step: Step) -> None:
+        step.depth = fit.iteration % 2 == 0 and bool(step.target.depth.any())
+
+    def compare(self, fit: Trainer, step: Step) -> None:
+        if step.depth:
+            weight = 2 * self.settings.lambda_depth
+            step.loss += weight * numerics.objectives.depth_loss(
+                step.rendering, step.target.depth, weight, step.d_planes[3], step.d_transmittance
+            )
+
+    def summary(self) -> Figures:
+        return {"lambda_depth": self.settings.lambda_depth}
+
+
+class Flow(Part, switch="lambda_flow", off=0.0):
+    """What is seen moves between two views as the photographs do."""
+
+    class Settings(PartSettings):
+        lambda_flow: Weight = 0.01
+        """weight of the flow loss, per pixel of flow error; 0: none"""
+
+    def __init__(self, fit: Trainer) -> None:
+        super().__init__(fit)
+        self.pairs = sum(target[1].flow is not None for target in fit.targets)
+
+    def ask(self, fit: Trainer, step: Step) -> None:
+        step.flow = step.target.flow if fit.iteration % 2 == 1 else None
+        if step.flow is not None:
+            there = fit.targets[step.flow.to][step.factor]
+            step.following = fit.viewpoint(step.flow.to, there)
+
+    def compare(self, fit: Trainer, step: Step) -> None:
+        if step.flow is not None:
+            weight = 2 * self.settings.lambda_flow
+            step.loss += weight * numerics.objectives.flow_loss(
+                step.rendering.planes[3:], step.rendering.transmittance, step.flow.flow,
+                step.flow.mask, weight, step.d_planes[3:], step.d_transmittance,
+            )  # fmt: skip
+
+    def summary(self) -> Figures:
+        return {"flow_pairs": self.pairs}
+
+
+class Variation(
+    Part, switch="lambda_tv", on=0.2, off=0.0, kept=("graph.neighbours", "graph.starts")
+):
+    """Draws the colours of neighbours together: harmonics, or the albedos that a light shades.
+
+    Attributes:
+        graph: of the neighbours.
+    """
+
+    class Settings(PartSettings):
+        lambda_tv: AutoFloat = automatic({3: 0.0}, held=0.2)
+        """weight of the mean difference between the colours of neighbouring Gaussians: albedos with
+        a light beside the lens, else harmonics"""
+        tv_neighbours: Annotated[int, Field(ge=1, le=64)] = 24
+        """Gaussians that each is compared with"""
+        tv_tolerance: Positive = 0.02
+        """differences of colour below this count by their squares only"""
+
+    def __init__(self, fit: Trainer) -> None:
+        s = fit.settings
+        self.graph = numerics.total_variation.TotalVariation(
+            s.lambda_tv, s.tv_neighbours, s.tv_tolerance
+        )
+
+    def guide(self, fit: Trainer, step: Step) -> None:
+        from stages.splatting.kernels.features import C0
+        from stages.splatting.kernels.projection import HARMONICS
+
+        if not fit.lit:
+            packed = fit.packed
+            self.graph.add(
+                packed[:, :3], packed, HARMONICS, packed.shape[1], step.gradients.packed, float(C0)
+            )
+
+    def select(self, source: Indices, fresh: Bools) -> None:
+        self.graph.forget()

@@ -1,0 +1,54 @@
+"""Parts of a method that are settings and nothing else: what a fit starts from and looks at."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from pipeline.artifacts.confidence import MEASURED
+from stages.fit.parts.base import Part
+from stages.fit.settings import AutoFloat, Count, PartSettings, Positive, Share, automatic
+
+
+class Filling(Part, absent={"trusted_confidence": 1.0, "fill_share": 1.0}):
+    """Points that were measured count for more than points that were filled in."""
+
+    class Settings(PartSettings):
+        trusted_confidence: AutoFloat = automatic({3: MEASURED}, held=1.0, ge=1)
+        """input points of less (raw) confidence were filled in: they are no depth prior, and are
+        left out where they stand before others"""
+        fill_tolerance: Share = 0.03
+        """how far behind measured points a filled one may be, as a share of the depth, to be taken
+        for the same surface (and left out)"""
+        fill_share: AutoFloat = automatic({3: 0.03, 6: 0.0}, le=1)
+        """largest share of the Gaussians that starts from points filled in: between many views,
+        what was not measured grows better from what was"""
+
+
+class Shading(Part, absent={"normal_neighbours": 0, "headlight": 0.0}):
+    """Harmonics start as a matte surface is lit from the camera."""
+
+    class Settings(PartSettings):
+        normal_neighbours: Annotated[int, Field(ge=0, le=200)] = 12
+        """average normals over so many points; 0: as they are"""
+        headlight: Annotated[float, Field(ge=0, lt=1)] = 0.6
+        """share of the light that comes from the camera, to start degree 1 from normals"""
+
+
+class Saturation(Part, absent={"saturation": 2.0}):  # above any colour
+    """What is white in a photograph may be brighter still."""
+
+    class Settings(PartSettings):
+        saturation: Positive = 0.98
+        """photographs are white from here on: a rendering may be brighter there without penalty"""
+
+
+class Coarse(Part, absent={"coarse_fraction": 0.0}):
+    """Images are small at first."""
+
+    class Settings(PartSettings):
+        coarse_fraction: Share = 0.6
+        """share of the iterations at reduced size"""
+        coarse_factor: Annotated[Count, Field(le=8)] = 2
+        """by which factor images are reduced then"""

@@ -1,0 +1,191 @@
+"""The surface of the input points: Gaussians are held to it, and it bends as a whole.
+
+See `numerics.surface`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.artifacts.confidence import MEASURED
+from stages.fit import numerics
+from stages.fit.arrays import Array, Bools, Floats, Indices
+from stages.fit.parts.base import Figures, Part, Step, interpolate
+from stages.fit.parts.light import Light
+from stages.fit.settings import (
+    AUTO,
+    AutoBool,
+    AutoFloat,
+    PartSettings,
+    Positive,
+    Share,
+    automatic,
+)
+
+if TYPE_CHECKING:
+    from pipeline.artifacts.cameras import Camera
+    from stages.fit.config import FitSettings
+    from stages.fit.trainer import Trainer
+
+#: up to so many views, a surface can be held
+FEW_VIEWS = 3
+#: what ``warp_slope: auto`` comes to, with a light beside the lens and without
+SLOPE_LIT, SLOPE = 2.0, 0.3
+
+
+class Surface(
+    Part, switch="hold_surface", on=True, off=False, needs=("cloud",), kept=("anchor", "turn")
+):
+    """Where each Gaussian belongs, and how firmly.
+
+    Attributes:
+        anchor, turn: as `numerics.surface.pull` has them.
+    """
+
+    class Settings(PartSettings):
+        hold_surface: AutoBool = automatic("up to 3 views that are far apart")
+        """keep Gaussians flat and on the surface of the input points, in proportion to
+        confidence"""
+        hold_min_angle: Annotated[float, Field(ge=0, le=180)] = 22.0
+        """hold_surface auto: neighbouring views further apart than this, degrees"""
+        hold_strength: Share = 0.15
+        """share of the way back that a sure Gaussian goes after each step"""
+        hold_flatness: Annotated[float, Field(gt=0, le=1)] = 0.6
+        """thickness of held Gaussians, relative to their width"""
+        hold_growth: Annotated[float, Field(ge=1)] = 2.0
+        """by which factor Gaussians of a held scene may get wider than they start"""
+        hold_colors_until: Share = 0.0
+        """up to this share of the iterations, held Gaussians change colour only"""
+
+    def __init__(self, fit: Trainer) -> None:
+        super().__init__(fit)
+        s, cloud, packed = self.settings, fit.cloud, fit.packed
+        assert cloud is not None
+        numerics.surface.along_normals(packed, cloud.normals, s.hold_flatness)
+        # the median of what was measured is sure
+        measured = cloud.weight[cloud.weight > MEASURED]
+        sure = float(np.median(measured)) if len(measured) else 2.0
+        firmness = np.clip((cloud.weight - 1) / (sure - 1), 0, 1) * s.hold_strength
+        firmness = firmness * (np.abs(cloud.normals).sum(1) > 0)
+        widest = packed[:, 7:9].max(1, keepdims=True) + np.log(s.hold_growth)
+        columns = [packed[:, :3], cloud.normals, packed[:, 9:10], firmness[:, None], widest]
+        self.anchor: Floats = np.concatenate(columns, 1).astype(np.float32)
+        self.turn: Floats = packed[:, 3:7].copy()
+
+    def still(self, done: float) -> bool:
+        """Whether Gaussians change colour only."""
+        return done < self.settings.hold_colors_until
+
+    def pace(self, step: Step) -> None:
+        if self.still(step.done):
+            step.rates[:11] = 0
+
+    def follow(self, fit: Trainer, step: Step) -> None:
+        numerics.surface.pull(fit.packed, self.anchor, self.turn)
+
+    def bend(self, move: Floats, normals: Floats) -> None:
+        """Go with a surface whose points have moved by [N, 3] and face [N, 3] (unit, or 0) now."""
+        self.turn = numerics.surface.turned(self.turn, self.anchor[:, 3:6], normals)
+        self.anchor[:, :3] += move
+        self.anchor[:, 3:6] = normals
+
+    def select(self, source: Indices, fresh: Bools) -> None:
+        self.anchor = np.ascontiguousarray(self.anchor[source])
+        self.turn = np.ascontiguousarray(self.turn[source])
+
+
+class Warp(
+    Part, switch="warp_levels", off=0, needs=("cloud",),
+    kept=("bend.field.coefficients", "bend.field.nodes", "bend.field.offsets", "bend.normals",
+          "bend.facing", "bend.shape", "bend.gradient", "bend.adam.first", "bend.adam.second",
+          "bend.adam.steps", "bend.collected"),
+):  # fmt: skip
+    """Attributes:
+    bend: how the surface is bent.
+    """
+
+    class Settings(PartSettings):
+        warp_levels: Annotated[int, Field(ge=0, le=8)] = 4
+        """bend the surface of the points as a whole by splines of so many widths, each twice the
+        one before; 0: Gaussians only move on their own"""
+        warp_spacing: Positive = 0.01
+        """spacing of the finest of these splines, as a share of the scene's depth"""
+        warp_spacing_px: Positive = 5.0
+        """and no less than so many pixels: what is finer no photograph can tell"""
+        warp_slope: AutoFloat = automatic(
+            f"{SLOPE_LIT} with a light beside the lens; {SLOPE} without, where highlights "
+            "that move would tear the surface",
+            ge=1e-3,
+        )
+        """no width of splines gets steeper than about this"""
+        # on a held surface nothing else moves it
+        warp_lr_init: AutoFloat = automatic({3: 1e-4}, held=3e-4)
+        """learning rate of the splines at the start, as a share of the scene's depth"""
+        warp_lr_final: AutoFloat = automatic({3: 1e-5}, held=1e-4)
+        """learning rate of the splines at the end"""
+
+    def __init__(self, fit: Trainer) -> None:
+        s, scene, cloud = fit.settings, fit.scene, fit.cloud
+        assert scene is not None and cloud is not None
+        self.rates = s.warp_lr_init, s.warp_lr_final
+        pixel = 1 / max(camera.fx for camera in scene.cameras)
+        self.bend = numerics.surface.Warp(
+            cloud.positions, cloud.normals, max(s.warp_spacing, s.warp_spacing_px * pixel),
+            s.warp_levels, steepest(s, fit.lit), len(scene.views),
+        )  # fmt: skip
+
+    def guide(self, fit: Trainer, step: Step) -> None:
+        """Let the surface as a whole follow the gradients of the Gaussians on it."""
+        light, surface, bend = fit.find(Light), fit.find(Surface), self.bend
+        if surface is not None and surface.still(step.done):
+            return
+        by_normal = None if light is None else light.by_normal
+        bend.collect(step.gradients.packed[:, :3], by_normal)
+        before = bend.facing
+        bent = bend.move(interpolate(*self.rates, step.done))
+        if bent is None:
+            return
+        fit.packed[:, :3] += bent.move
+        fit.packed[:, 3:7] = numerics.surface.turned(fit.packed[:, 3:7], before, bend.facing)
+        if light is not None:
+            light.material[:, 3:] += bent.lean
+        if surface is not None:
+            surface.bend(bent.move, bend.facing)
+
+    def select(self, source: Indices, fresh: Bools) -> None:
+        self.bend.select(source)
+
+    def summary(self) -> Figures:
+        return {"surface_bent": round(self.bend.reach(), 5)}
+
+
+def steepest(s: FitSettings, lit: bool) -> float:
+    """The slope that a warp may have: more where highlights are not taken for shape."""
+    given: Any = s.warp_slope
+    return float(given) if given != AUTO else SLOPE_LIT if lit else SLOPE
+
+
+def worth_holding(cameras: Sequence[Camera], positions: Array, least_angle: float) -> bool:
+    """What ``hold_surface: auto`` comes to.
+
+    Where neighbouring views are too far apart to be matched, the points are a surface that was
+    inferred as a whole, and the photographs can't correct it. Where views do overlap closely,
+    holding costs more than it gives.
+
+    Args:
+        cameras: the placed ones.
+        positions: [N, 3] the points, in the world of the cameras.
+        least_angle: degrees that every two views are apart, seen from the middle of the points.
+    """
+    if not 2 <= len(cameras) <= FEW_VIEWS:
+        return False
+    rays = np.array([camera.centre for camera in cameras]) - np.median(positions, axis=0)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    cosines = rays @ rays.T
+    np.fill_diagonal(cosines, -1)
+    closest = np.degrees(np.arccos(np.clip(cosines.max(), -1, 1)))
+    return bool(closest > least_angle)
