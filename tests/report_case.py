@@ -17,7 +17,7 @@ from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import HeldOut, View, Views, write_png
 from pipeline.store import Store
-from stages.evaluate.pictures import comparison
+from stages.evaluate.images.pictures import comparison
 
 WIDTH, HEIGHT = 64, 48
 HOSTILE = "<b>x&.jpg"

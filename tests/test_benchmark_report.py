@@ -12,7 +12,7 @@ from pipeline.artifacts.views import write_png
 from pipeline.studies.benchmark.report import benchmark_report, charts, grid_table, groups
 from pipeline.studies.benchmark.suite import Suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
-from stages.evaluate.pictures import comparison
+from stages.evaluate.images.pictures import comparison
 from tests import report_case as case
 from tests.browser import needs_chromium
 from tests.report_page import assert_alone, look, text_of

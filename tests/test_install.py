@@ -158,7 +158,7 @@ def test_a_missing_library_says_which_extra_brings_it() -> None:
 
 
 def test_lpips_is_left_out_without_torch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from stages.evaluate import perceptual
+    from stages.evaluate.images import perceptual
 
     cached = tmp_path / "hub" / "checkpoints" / perceptual.VGG_FILE
     cached.parent.mkdir(parents=True)

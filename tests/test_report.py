@@ -19,7 +19,7 @@ from pipeline.pages.pictures import picture, points_image, thirds
 from pipeline.pages.tables import views_table
 from pipeline.runner import RunSummary
 from pipeline.studies.report import run_report
-from stages.evaluate.pictures import comparison
+from stages.evaluate.images.pictures import comparison
 from stages.flow.report import flow_colors
 from tests import report_case as case
 from tests.browser import browse, needs_chromium

@@ -16,7 +16,6 @@ from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
 from pipeline.geometry.pose_metrics import pose_figures
 from pipeline.stage import StageContext
-from stages.evaluate import pictures
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.held_out import (
     ALIGNMENT,
@@ -26,10 +25,11 @@ from stages.evaluate.held_out import (
     scene_depth,
     without_lens,
 )
-from stages.evaluate.perceptual import Lpips
+from stages.evaluate.images import pictures
+from stages.evaluate.images.perceptual import Lpips
+from stages.evaluate.images.score import Figures, summary_of
 from stages.evaluate.refinement import RefinementOptions, refine_camera
 from stages.evaluate.scene import Examiner
-from stages.evaluate.score import Figures, summary_of
 from stages.evaluate.support import LEGEND, SeenSurface, beyond
 from stages.evaluate.truth import Truth, read_truth, scoring_mask
 

@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, to_uint8, write_png
-from stages.evaluate import pictures
 from stages.evaluate.config import EvaluateConfig
-from stages.evaluate.perceptual import flip_map
-from stages.evaluate.score import COVERED, Figures, score_view
+from stages.evaluate.images import pictures
+from stages.evaluate.images.perceptual import flip_map
+from stages.evaluate.images.score import COVERED, Figures, score_view
 from stages.evaluate.support import (
     SeenSurface,
     overlay,

@@ -31,7 +31,7 @@ class EvaluateStage(Stage):
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
         from pipeline.geometry.models.known_cameras import model_files
-        from stages.evaluate.perceptual import find_vgg_weights
+        from stages.evaluate.images.perceptual import find_vgg_weights
 
         found: dict[str, Path] = {}
         if config.ground_truth is not None:

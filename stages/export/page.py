@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
-from stages.export.orbits import Orbit
+from stages.export.pictures.orbits import Orbit
 from stages.export.splats import PER_ROW, pack, texels, used_degree, visible, with_material
 
 HERE = Path(__file__).parent

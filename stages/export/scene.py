@@ -13,7 +13,8 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views, to_uint8
 from stages.export.frame import move_cameras, move_gaussians, move_points
-from stages.export.orbits import Orbit, between, central_depth, find_orbit, there_and_back
+from stages.export.pictures.orbits import Orbit, between, central_depth, find_orbit, there_and_back
+from stages.export.pictures.video import even
 from stages.export.splats import opacities
 from stages.export.surface import (
     DEEPEST_OCTREE,
@@ -27,7 +28,6 @@ from stages.export.surface import (
     spacing,
     trusted_depth,
 )
-from stages.export.video import even
 from stages.splatting.rendering import RenderedView, render
 
 Progress = Callable[..., None]

@@ -221,7 +221,7 @@ def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 
 def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
-    from stages.export.video import write_video
+    from stages.export.pictures.video import write_video
 
     config: ExportConfig = context.config
     path = scene.path(config.video_seconds, config.video_fps, config.video_sway)
@@ -257,7 +257,7 @@ def _write_preview(
     folder: Path,
 ) -> None:
     from pipeline.artifacts.views import to_uint8
-    from stages.export.preview import beside, contact_sheet, panel_size, shade_mesh
+    from stages.export.pictures.preview import beside, contact_sheet, panel_size, shade_mesh
 
     context.progress("preview", 0, 1)
     middle = scene.orbit.middle()

@@ -15,11 +15,11 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from stages.fit.backend import use_backend
 from stages.fit.config import FitSettings
-from stages.fit.initial import Frame
+from stages.fit.inputs.initial import Frame
+from stages.fit.inputs.scene import prepare
 from stages.fit.lighting import choose_light, harmonics_for_viewers
 from stages.fit.parts.camera import Background
 from stages.fit.parts.light import Light
-from stages.fit.scene import prepare
 from stages.fit.trainer import Trainer
 from stages.splatting.rasterizer import rasterize, unpack, use_threads
 

@@ -10,11 +10,11 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import MEASURED
 from pipeline.errors import ReconstructionError
 from stages.fit.config import FitSettings
-from stages.fit.initial import facing, headlight_harmonics
+from stages.fit.inputs.initial import facing, headlight_harmonics
+from stages.fit.inputs.scene import Scene
 from stages.fit.numerics.light import prediction_errors
 from stages.fit.parts.camera import Background, Exposure
 from stages.fit.parts.light import Light
-from stages.fit.scene import Scene
 from stages.fit.trainer import Trainer
 from stages.splatting.kernels.projection import HARMONICS
 

@@ -13,17 +13,17 @@ import numpy as np
 from pipeline.errors import ReconstructionError
 from stages.fit.arrays import Array, Bools, Floats, Indices
 from stages.fit.config import PARTS, FitSettings
+from stages.fit.inputs.targets import Target
 from stages.fit.parts.base import Part, Step, interpolate, restore_state, state_of
 from stages.fit.parts.camera import PoseOptimizer, SharedFocal
 from stages.fit.records import load_checkpoint, save_checkpoint, write_curve, write_preview
-from stages.fit.targets import Target
 from stages.splatting.adam import Adam
 from stages.splatting.kernels.projection import HARMONICS
 from stages.splatting.rasterizer import Rendering, Viewpoint, rasterize
 
 if TYPE_CHECKING:
-    from stages.fit.initial import Cloud
-    from stages.fit.scene import Scene
+    from stages.fit.inputs.initial import Cloud
+    from stages.fit.inputs.scene import Scene
 
 P = TypeVar("P", bound=Part)
 

@@ -24,11 +24,11 @@ Progress = Callable[[str, int, int], None]
 
 #: Module and class of each adapter; imported when it is asked for.
 _ADAPTERS = {
-    "dust3r": ("stages.pointmaps.dust3r", "Dust3r"),
-    "mast3r": ("stages.pointmaps.mast3r", "Mast3r"),
-    "must3r": ("stages.pointmaps.must3r", "Must3r"),
-    "vggt": ("stages.pointmaps.vggt", "Vggt"),
-    "mapanything": ("stages.pointmaps.mapanything", "MapAnything"),
+    "dust3r": ("stages.pointmaps.models.dust3r", "Dust3r"),
+    "mast3r": ("stages.pointmaps.models.mast3r", "Mast3r"),
+    "must3r": ("stages.pointmaps.models.must3r", "Must3r"),
+    "vggt": ("stages.pointmaps.models.vggt", "Vggt"),
+    "mapanything": ("stages.pointmaps.models.mapanything", "MapAnything"),
 }
 
 

@@ -12,7 +12,7 @@ from stages.init.dental.cameras.held import HeldCameras, nearest_similarity
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.place_known import neighbour_angle
-from stages.init.dental.surface.charts import Chart
+from stages.init.dental.surface.chart.jaws import Chart
 from stages.init.dental.surface.grow import go_on_straight
 from stages.init.dental.template import textbook_arch
 from tests.stages import test_dental_arch as arch_scene
@@ -192,15 +192,15 @@ def test_gum_goes_on_with_the_slope_that_it_has() -> None:
 
 
 def gum_of(chart: Chart) -> np.ndarray:
-    from stages.init.dental.surface.crown_shape import beyond_crowns
+    from stages.init.dental.surface.chart.crown_shape import beyond_crowns
 
     return beyond_crowns(chart.grid, chart.shape)[0]
 
 
 def grown_chart() -> Chart:
     """An upper jaw whose gum leans outwards 4 mm beyond the gum line; further up it is wrong."""
-    from stages.init.dental.surface.chart import ChartGrid
-    from stages.init.dental.surface.crown_shape import jaw_shape
+    from stages.init.dental.surface.chart.crown_shape import jaw_shape
+    from stages.init.dental.surface.chart.grid import ChartGrid
 
     marks = row_of_teeth()
     shape = jaw_shape("upper", marks, {mark.tooth for mark in marks}, set())

@@ -8,9 +8,9 @@ import functools
 import numpy as np
 import pytest
 
-from stages.init.dental.pictures.turned import render_turned, turned_sheet
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.turned_sheet import render_turned, turned_sheet
 from tests.stages.dental_arch_scene import scene
 
 GUM, TOOTH, GLOVE = 1, 2, 3

@@ -9,7 +9,7 @@ import pytest
 
 from stages.init.dental.surface import grow as surface_grow
 from stages.init.dental.surface.carve import carved, in_void
-from stages.init.dental.surface.chart import ChartGrid, normals_of
+from stages.init.dental.surface.chart.grid import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.grow import best_bend
 from stages.init.dental.surface.photo import find_void

@@ -8,7 +8,8 @@ import pytest
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.surface.chart import (
+from stages.init.dental.surface.chart.crown_shape import crown_points, crown_radius, jaw_shape
+from stages.init.dental.surface.chart.grid import (
     AXIS_DEPTH,
     ChartGrid,
     faces_of,
@@ -16,7 +17,8 @@ from stages.init.dental.surface.chart import (
     normals_of,
     unroll,
 )
-from stages.init.dental.surface.charts import teeth_present
+from stages.init.dental.surface.chart.jaws import teeth_present
+from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.colour import (
     blend,
     even_rim,
@@ -24,11 +26,9 @@ from stages.init.dental.surface.colour import (
     hidden_edges,
     spread_colour,
 )
-from stages.init.dental.surface.crown_shape import crown_points, crown_radius, jaw_shape
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo, find_gum
-from stages.init.dental.surface.raster import raster_chart, sees
 from stages.init.dental.surface.sweep import choose_pairs, matching_cost
 
 GRID = ChartGrid(left=-20.0, top=5.0, density=4.0, shape=(41, 161))

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from stages.evaluate.metrics import psnr, ssim, ssim_map
-from stages.evaluate.pictures import GAP, comparison, error_map, spread
-from stages.evaluate.score import LARGEST_PSNR, score_view, summary_of
+from stages.evaluate.images.metrics import psnr, ssim, ssim_map
+from stages.evaluate.images.pictures import GAP, comparison, error_map, spread
+from stages.evaluate.images.score import LARGEST_PSNR, score_view, summary_of
 
 Image = npt.NDArray[np.uint8]
 

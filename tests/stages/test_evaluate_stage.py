@@ -17,7 +17,7 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext, get_stage
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.evaluation import evaluate
-from stages.evaluate.metrics import psnr, ssim
+from stages.evaluate.images.metrics import psnr, ssim
 from stages.evaluate.stage import EvaluateStage
 
 

@@ -15,7 +15,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rigid import exponential
 from stages.evaluate.geometry import geometry_figures
 from stages.evaluate.held_out import register
-from stages.evaluate.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights, flip_map
+from stages.evaluate.images.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights, flip_map
 from stages.evaluate.support import (
     TINT,
     SeenSurface,

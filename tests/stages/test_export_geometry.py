@@ -13,7 +13,13 @@ from stages.export.frame import (
     move_points,
     split_similarity,
 )
-from stages.export.orbits import between, central_depth, find_orbit, look_at, there_and_back
+from stages.export.pictures.orbits import (
+    between,
+    central_depth,
+    find_orbit,
+    look_at,
+    there_and_back,
+)
 from stages.splatting.rendering import render
 from tests.stages import export_scene as scene
 

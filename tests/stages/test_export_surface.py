@@ -7,7 +7,7 @@ import open3d
 
 from pipeline.artifacts.cameras import Camera
 from stages.export.mesh_files import write_mesh_ply, write_stl
-from stages.export.orbits import look_at
+from stages.export.pictures.orbits import look_at
 from stages.export.surface import (
     Mesh,
     drop_small_parts,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import to_uint8
-from stages.export.orbits import find_orbit
 from stages.export.page import build_page, rasterizer_constants
+from stages.export.pictures.orbits import find_orbit
 from stages.export.splats import coefficients, pack, texels, used_degree, visible
 from stages.splatting.rendering import render
 from tests.browser import browse, console, needs_chromium

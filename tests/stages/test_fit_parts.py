@@ -9,12 +9,12 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.config import FitConfig, resolve
-from stages.fit.initial import Cloud, smooth_normals, thin
+from stages.fit.inputs.initial import Cloud, smooth_normals, thin
+from stages.fit.inputs.scene import out_of_place, trusted_points
+from stages.fit.inputs.targets import Target, make_target
 from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
 from stages.fit.parts.camera import Background, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
-from stages.fit.scene import out_of_place, trusted_points
-from stages.fit.targets import Target, make_target
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:

@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import exponential
 from stages.fit.config import FitConfig
-from stages.fit.initial import Cloud, initial_gaussians
+from stages.fit.inputs.initial import Cloud, initial_gaussians
 from stages.fit.parts.camera import PoseOptimizer
 from stages.fit.parts.progressive import next_pose
 from stages.fit.stage import FitStage

@@ -14,7 +14,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.rigid import exponential
 from pipeline.stage import LocalContext
-from stages.fit.initial import Cloud, initial_gaussians
+from stages.fit.inputs.initial import Cloud, initial_gaussians
 from stages.fit.stage import FitConfig, FitStage
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack

@@ -11,8 +11,8 @@ import pytest
 from pipeline.artifacts.teeth import Crown, Dentition
 from pipeline.artifacts.views import View
 from stages.dentition.crowns import mirrored_dentition
+from stages.init.dental.mirror_images import Turned, fit_turned, says_side, turnings
 from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.turned import Turned, fit_turned, says_side, turnings
 
 WIDTH, HEIGHT = 60, 20
 SIDES = ("right", "frontal", "left")

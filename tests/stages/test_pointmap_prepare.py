@@ -8,7 +8,7 @@ import pytest
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from stages.pointmaps.graph import choose_graph, scene_pairs
-from stages.pointmaps.mapanything import SHAPES
+from stages.pointmaps.models.mapanything import SHAPES
 from stages.pointmaps.prepare import (
     clean_map,
     fixed_width,

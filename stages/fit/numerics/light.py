@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.arrays import Array, Bools, Floats, Indices
-from stages.fit.config import FitSettings
-from stages.fit.initial import Cloud, facing, smooth_normals
-from stages.fit.targets import point_depth
+from stages.fit.inputs.initial import Cloud, facing, smooth_normals
+from stages.fit.inputs.targets import point_depth
+
+if TYPE_CHECKING:
+    from stages.fit.config import FitSettings
 
 #: shares of light from the lens that are tried, the first of them none
 SHARES = np.linspace(0, 0.95, 20)

@@ -15,7 +15,7 @@ import numpy as np
 from stages.fit.arrays import Array, Arrays, Bools, Floats, Indices
 
 if TYPE_CHECKING:
-    from stages.fit.targets import FlowTarget, Target
+    from stages.fit.inputs.targets import FlowTarget, Target
     from stages.fit.trainer import Trainer
     from stages.splatting.rasterizer import Gradients, Rendering, Viewpoint
 

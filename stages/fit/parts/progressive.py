@@ -33,7 +33,7 @@ from stages.fit.settings import Count, PartSettings, Positive
 if TYPE_CHECKING:
     from pipeline.artifacts.cameras import Camera
     from pipeline.artifacts.views import View
-    from stages.fit.initial import Cloud
+    from stages.fit.inputs.initial import Cloud
     from stages.fit.trainer import Trainer
 
 #: where Gaussians let more light through than this, they don't show what a frame sees
@@ -69,7 +69,7 @@ class Progressive(
 
         Lenses, order and depth come from the scene's cameras; of the poses, only the first one's.
         """
-        from stages.fit.initial import thin
+        from stages.fit.inputs.initial import thin
 
         super().__init__(fit)
         assert fit.scene is not None
@@ -144,7 +144,7 @@ class Progressive(
 
     def _gaussians(self, view: int, pose: Array) -> Floats:
         """Packed Gaussians of a frame's points, seen from a pose [3, 4]."""
-        from stages.fit.initial import initial_gaussians
+        from stages.fit.inputs.initial import initial_gaussians
 
         s, cloud = self.settings, self.clouds[view]
         camera = replace(self.cameras[view], cam_from_world=np.vstack([pose, [0, 0, 0, 1]]))
@@ -160,8 +160,8 @@ def seen_by(view: View, camera: Camera, positions: Array) -> Cloud:
 
     Their colours are the photograph's; they have no normals.
     """
-    from stages.fit.initial import Cloud
-    from stages.fit.targets import point_depth
+    from stages.fit.inputs.initial import Cloud
+    from stages.fit.inputs.targets import point_depth
 
     depth = point_depth(positions, camera, view.width, view.height)
     seen = (depth > 0) & view.valid()

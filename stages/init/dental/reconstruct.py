@@ -13,13 +13,13 @@ from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from stages.dentition.overlay import labelled_overlay, sheet
+from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.pictures.turned import turned_sheet
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.turned import Turned, fit_turned
+from stages.init.dental.turned_sheet import turned_sheet
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

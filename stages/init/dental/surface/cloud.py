@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.surface.chart import ChartGrid, faces_of
-from stages.init.dental.surface.charts import (
+from stages.init.dental.surface.chart.crown_shape import beyond_crowns, within_crowns
+from stages.init.dental.surface.chart.grid import ChartGrid, faces_of
+from stages.init.dental.surface.chart.jaws import (
     HIDDEN,
     PAST_EDGE,
     Chart,
@@ -17,6 +18,7 @@ from stages.init.dental.surface.charts import (
     nearest_depths,
     smooth_normals,
 )
+from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.colour import (
     Showing,
     blend,
@@ -28,10 +30,8 @@ from stages.init.dental.surface.colour import (
     show,
     spread_colour,
 )
-from stages.init.dental.surface.crown_shape import beyond_crowns, within_crowns
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo
-from stages.init.dental.surface.raster import raster_chart, sees
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]

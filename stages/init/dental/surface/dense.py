@@ -18,7 +18,7 @@ from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from pipeline.kernels import kernel_threads
 from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface.charts import (
+from stages.init.dental.surface.chart.jaws import (
     PAST_EDGE,
     Chart,
     comparable,
@@ -27,11 +27,11 @@ from stages.init.dental.surface.charts import (
     smooth_normals,
     start_chart,
 )
+from stages.init.dental.surface.chart.raster import raster_chart
 from stages.init.dental.surface.cloud import coloured_cloud
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import Photo, prepare_photo
-from stages.init.dental.surface.raster import raster_chart
 from stages.init.dental.surface.sweep import choose_pairs, sweep
 from stages.init.parallel import in_threads
 

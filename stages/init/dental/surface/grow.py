@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from stages.init.dental.surface.chart import ChartGrid
-from stages.init.dental.surface.charts import PAST_EDGE, Chart, comparable, nearest_depths
-from stages.init.dental.surface.crown_shape import beyond_crowns
+from stages.init.dental.surface.chart.crown_shape import beyond_crowns
+from stages.init.dental.surface.chart.grid import ChartGrid
+from stages.init.dental.surface.chart.jaws import PAST_EDGE, Chart, comparable, nearest_depths
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo
 from stages.init.dental.surface.sweep import match, sweep

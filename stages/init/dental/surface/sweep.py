@@ -16,7 +16,7 @@ from numba import prange
 
 from pipeline.kernels import helper, kernel
 from stages.init.dental.surface.carve import carved, in_void
-from stages.init.dental.surface.chart import ChartGrid, normals_of
+from stages.init.dental.surface.chart.grid import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import Photo

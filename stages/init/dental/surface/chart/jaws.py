@@ -11,17 +11,17 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
 from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface.chart import ChartGrid, grid_around, normals_of
-from stages.init.dental.surface.crown_shape import (
+from stages.init.dental.surface.chart.crown_shape import (
     JawShape,
     beyond_crowns,
     crown_points,
     crown_radius,
     jaw_shape,
 )
+from stages.init.dental.surface.chart.grid import ChartGrid, grid_around, normals_of
+from stages.init.dental.surface.chart.raster import nearest_of, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo
-from stages.init.dental.surface.raster import nearest_of, raster_chart, sees
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]

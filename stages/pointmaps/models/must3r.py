@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pipeline.artifacts.views import View
-from stages.pointmaps.dust3r import as_signed_tensor
 from stages.pointmaps.interface import ModelCard, PreparedView, ViewPrediction
 from stages.pointmaps.loading import import_module, offline, required_checkpoint, to_numpy
+from stages.pointmaps.models.dust3r import as_signed_tensor
 from stages.pointmaps.options import PointmapOptions
 from stages.pointmaps.prepare import multiple_of_patch, prepare
 

@@ -13,8 +13,15 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View
 from stages.fit.arrays import Array, Bools, Floats
 from stages.fit.config import FitSettings
-from stages.fit.initial import Cloud, Frame, choose_frame, initial_gaussians, smooth_normals, thin
-from stages.fit.targets import Target, make_pyramids, point_depth
+from stages.fit.inputs.initial import (
+    Cloud,
+    Frame,
+    choose_frame,
+    initial_gaussians,
+    smooth_normals,
+    thin,
+)
+from stages.fit.inputs.targets import Target, make_pyramids, point_depth
 from stages.fit.trainer import Trainer
 
 Flows = dict[int, tuple[int, Floats, Bools]]

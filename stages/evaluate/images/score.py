@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stages.evaluate.metrics import psnr, ssim
+from stages.evaluate.images.metrics import psnr, ssim
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]

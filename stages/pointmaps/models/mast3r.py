@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from stages.pointmaps.dust3r import Dust3r
 from stages.pointmaps.interface import ModelCard
+from stages.pointmaps.models.dust3r import Dust3r
 
 
 class Mast3r(Dust3r):

@@ -10,7 +10,7 @@ from scipy.interpolate import RBFInterpolator
 
 from pipeline.artifacts.dental.fdi import Jaw, teeth_of
 from stages.init.dental.landmarks import Landmark
-from stages.init.dental.surface.chart import AXIS_DEPTH, ChartGrid, unroll
+from stages.init.dental.surface.chart.grid import AXIS_DEPTH, ChartGrid, unroll
 from stages.init.dental.template import GUM_STEPS
 
 Array32 = npt.NDArray[np.float32]

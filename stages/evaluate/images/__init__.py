@@ -1,0 +1,1 @@
+"""Figures of a photograph beside its render, and pictures of both."""

@@ -1,0 +1,1 @@
+"""Orbits around the scene, the video along one, and the preview."""

@@ -1,1 +1,0 @@
-"""What is drawn of the teeth for people to check."""

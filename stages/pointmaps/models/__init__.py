@@ -1,0 +1,1 @@
+"""One module per pointmap model that a user may have installed."""
