@@ -218,11 +218,12 @@ def warmup_command() -> None:
     """
     from pipeline.kernels import folder
     from pipeline.kernels.rehearsals import Background
+    from pipeline.measure import usable_cores
     from pipeline.stage import usable_stages
 
     background = Background()
     try:
-        background.start(usable_stages(), processes=len(os.sched_getaffinity(0)))
+        background.start(usable_stages(), processes=usable_cores())
         well = background.wait()
     finally:
         background.stop()
