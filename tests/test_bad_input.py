@@ -112,7 +112,7 @@ def test_unusable_photographs(
     [
         (("--stages", "views,inti"), ["'inti'", "Did you mean 'init'?"]),
         (("--set", "sap.quantile=7"), ["sap.quantile=7", "less than 1"]),
-        (("--set", "sap.quantil=0.9"), ["'sap.quantil'", "Did you mean 'quantile'?"]),
+        (("--set", "sap.quantil=0.9"), ["'sap.quantil'", "Did you mean sap.quantile"]),
         (("--set", "fit.iterations=none"), ["fit.iterations"]),
         (("-c", "dentalsplatt"), ["Did you mean 'dentalsplat'?"]),
         (("--frames", "-3"), ["views.frames"]),

@@ -115,7 +115,8 @@ def _processor() -> str:
 
 
 def main(names: Sequence[str]) -> None:
-    os.nice(NICENESS)
+    with contextlib.suppress(AttributeError):  # Windows has none
+        os.nice(NICENESS)
     for name in names:
         hold(name)
 
