@@ -8,6 +8,7 @@ if TYPE_CHECKING:
         background,
         density,
         light,
+        moments,
         objectives,
         surface,
         total_variation,

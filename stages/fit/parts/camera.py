@@ -71,12 +71,16 @@ class Background(
         if not self.learned:
             return
         self.steps += 1
-        self.moments[0] = 0.9 * self.moments[0] + 0.1 * gradient
-        self.moments[1] = 0.99 * self.moments[1] + 0.01 * gradient**2
-        mean = self.moments[0] / (1 - 0.9**self.steps)
-        spread = np.sqrt(self.moments[1] / (1 - 0.99**self.steps))
-        rate = self.settings.background_lr
-        self.values = np.clip(self.values - rate * mean / (spread + 1e-15), 0, 1)
+        move, *moments = numerics.moments.adam_step(
+            gradient,
+            self.moments[0],
+            self.moments[1],
+            self.steps,
+            self.settings.background_lr,
+            0.99,
+        )
+        self.moments[:] = moments
+        self.values = np.clip(self.values - move, 0, 1)
 
 
 class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "moments")):
@@ -117,10 +121,11 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
         by_gain = (d_image * self.before).sum((1, 2), dtype=np.float64)
         gradient = np.stack([by_gain, d_image.sum((1, 2), dtype=np.float64)])
         first, second = self.moments[:, step.view]
-        first[:] = 0.9 * first + 0.1 * gradient
-        second[:] = 0.999 * second + 0.001 * gradient**2
-        mean, spread = first / (1 - 0.9**steps), np.sqrt(second / (1 - 0.999**steps))
-        self.values[step.view] -= self.settings.exposure_lr * mean / (spread + 1e-15)
+        move, *moments = numerics.moments.adam_step(
+            gradient, first, second, steps, self.settings.exposure_lr
+        )
+        self.moments[:, step.view] = moments
+        self.values[step.view] -= move
         # a gain common to all views is the scene's brightness
         self.values[:, 0] /= self.values[:, 0].mean(0)
         self.values[:, 1] -= self.values[:, 1].mean(0)
@@ -194,12 +199,10 @@ class PoseOptimizer:
         if pivot is not None:
             gradient = gradient + np.concatenate([np.zeros(3), np.cross(gradient[:3], pivot)])
         self.steps[view] += 1
-        step = int(self.steps[view])
-        self.first[view] = 0.9 * self.first[view] + 0.1 * gradient
-        self.second[view] = 0.999 * self.second[view] + 0.001 * gradient**2
-        mean = self.first[view] / (1 - 0.9**step)
-        spread = np.sqrt(self.second[view] / (1 - 0.999**step))
-        twist = -rate * mean / (spread + 1e-15)
+        move, self.first[view], self.second[view] = numerics.moments.adam_step(
+            gradient, self.first[view], self.second[view], int(self.steps[view]), rate
+        )
+        twist = -move
         if pivot is not None:
             twist[:3] += np.cross(pivot, twist[3:])
         self.poses[view] = moved_by(twist, self.poses[view])
@@ -227,8 +230,7 @@ class SharedFocal:
         """Move against the gradient [2] of fx and fy of a view whose intrinsics [4] were used."""
         by_log = float(gradient @ intrinsics[:2].astype(np.float64))
         self.steps += 1
-        self.first = 0.9 * self.first + 0.1 * by_log
-        self.second = 0.999 * self.second + 0.001 * by_log**2
-        mean = self.first / (1 - 0.9**self.steps)
-        spread = (self.second / (1 - 0.999**self.steps)) ** 0.5
-        self.log_factor -= rate * mean / (spread + 1e-15)
+        move, self.first, self.second = numerics.moments.adam_step(
+            by_log, self.first, self.second, self.steps, rate
+        )
+        self.log_factor -= float(move)

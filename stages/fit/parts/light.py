@@ -158,15 +158,14 @@ class Light(
         slope = self.values.copy()  # of the values by what Adam moves
         slope[0], slope[1] = k * (1 - k), 1
         g = gradient * slope
-        self.first = 0.9 * self.first + 0.1 * g
-        self.second = 0.99 * self.second + 0.01 * g**2
-        steps = self.adam.steps
         rates = np.array(
             [s.light_lr, s.light_falloff_lr, s.light_lr, s.light_strength_lr, s.light_lr,
              s.light_strength_lr]
         )  # fmt: skip
-        mean, spread = self.first / (1 - 0.9**steps), np.sqrt(self.second / (1 - 0.99**steps))
-        move = -fall * rates * mean / (spread + 1e-15)
+        step, self.first, self.second = numerics.moments.adam_step(
+            g, self.first, self.second, self.adam.steps, fall * rates, 0.99
+        )
+        move = -step
         odds = k / (1 - k) * np.exp(move[0])
         moved = self.values * np.exp(move)
         moved[0], moved[1] = odds / (1 + odds), self.values[1] + move[1]
