@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from pipeline.config import Config, load_config, result_fields
 from stages.fit.config import PARTS, FitConfig, FitSettings, PartName, resolve
 from stages.fit.stage import FitStage
-from tests.stages.test_fit_trainer import case, context
+from tests.stages.fit_case import case, context
 
 BASELINES = ("3dgs", "instantsplat", "cf3dgs")
 ABLATIONS = {
