@@ -128,5 +128,5 @@ def test_a_preset_runs(tmp_path, name: str) -> None:
                "initial_points": 1500, "progressive_pose_iterations": 5}  # fmt: skip
     here = context(tmp_path, views, cameras, points, **values)
     FitStage().run(here)
-    assert here.figures["gaussians"] > 100
-    assert here.figures["train_psnr"] > 8
+    assert (here.figures["gaussians"] > 2000) == (name != "instantsplat")  # which never splits
+    assert here.figures["train_psnr"] > 14  # 15.3 to 22.5 when this was written; 12.9 on the way
