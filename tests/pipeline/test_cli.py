@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from test_runner import artifact_bytes
+from toy import artifact_bytes
 
 TOY = Path(__file__).parent / "toy.py"
 

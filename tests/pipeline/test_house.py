@@ -222,3 +222,21 @@ def test_every_folder_is_packaged(home: str) -> None:
         if path.suffix in (".html", ".css", ".js", ".glsl", ".onnx"):
             package = ".".join(path.parent.relative_to(ROOT).parts)
             assert f"*{path.suffix}" in data.get(package, ""), path
+
+
+def test_no_test_module_imports_another() -> None:
+    """What tests share is in modules beside them."""
+    found = []
+    for path in (ROOT / "tests").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names: list[str] = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            found += [
+                f"{path.relative_to(ROOT)}: {name}"
+                for name in names
+                if any(part.startswith("test_") for part in name.split("."))
+            ]
+    assert found == []

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from toy import artifact_bytes
 
 import pipeline
 from pipeline.artifacts.views import read_png
@@ -17,15 +18,6 @@ from pipeline.store import Store
 
 ALL_RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
 ALL_CACHED = dict.fromkeys(ALL_RAN, "cached")
-
-
-def artifact_bytes(workspace: Path) -> dict[str, bytes]:
-    """Bytes of all artifacts of all committed results; the manifests hold timings."""
-    return {
-        str(path.relative_to(workspace)): path.read_bytes()
-        for path in sorted(workspace.rglob("*"))
-        if path.is_file() and len(path.relative_to(workspace).parts) > 3
-    }
 
 
 def test_second_run_computes_nothing(run: Any) -> None:

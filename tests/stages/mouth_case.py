@@ -15,7 +15,14 @@ import numpy as np
 
 from data_samples.mouths import Mouth, Photograph, photograph, random_mouth
 from data_samples.mouths.cameras import Camera, look
-from pipeline.artifacts.dental.fdi import is_left, is_primary, is_upper, permanent_of, primary_of
+from pipeline.artifacts.dental.fdi import (
+    JAWS,
+    is_left,
+    is_primary,
+    is_upper,
+    permanent_of,
+    primary_of,
+)
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import angle_between
@@ -23,6 +30,8 @@ from stages.dentition.crowns import Outline, dentition_of
 
 WIDTH, HEIGHT = 512, 384
 ROLES = ("right", "front", "left")
+#: A wrong number is none if this much doubt is said beside it.
+DOUBTED = 0.05
 #: A textbook mouth where nothing else is said: nobody's, but without the generator's rarities.
 CALM = {
     "dentition": "permanent", "missing": (18, 28, 38, 48), "bite": "normal", "overbite": 2.2,
@@ -219,3 +228,17 @@ def landmarks_of(mouth: Mouth) -> dict[tuple[str, int], np.ndarray]:
                 ]
                 marks[name, right.plan.fdi] = (sides[0] + sides[1]) / 2
     return marks
+
+
+def wrong_numbers(photographed: Case, numbered: list[Dentition]) -> tuple[list[str], float]:
+    """What has a wrong number without a doubt, and the share of the crowns named right."""
+    wrong, right, total = [], 0, 0
+    for photo, dentition in zip(photographed.photos, numbered, strict=True):
+        truth = true_numbers(photo, dentition)
+        for jaw in JAWS:
+            for crown, true in zip(dentition.crowns(jaw), truth[jaw], strict=True):
+                total += 1
+                right += crown.number == true
+                if crown.number not in (0, true) and crown.doubt < DOUBTED:
+                    wrong.append(f"{dentition.kind}: {true} was named {crown.number}")
+    return wrong, right / total

@@ -15,8 +15,8 @@ from stages.init.dental.place_known import neighbour_angle
 from stages.init.dental.surface.chart.jaws import Chart
 from stages.init.dental.surface.grow import go_on_straight
 from stages.init.dental.template import textbook_arch
-from tests.stages import test_dental_arch as arch_scene
-from tests.stages.test_dental_surface_parts import row_of_teeth
+from tests.stages import dental_patient
+from tests.stages.dental_surface_case import row_of_teeth
 
 WORLD_UNIT = 0.07  # of the known cameras' world per mm
 TURN = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
@@ -33,7 +33,7 @@ def in_world(pose: np.ndarray) -> np.ndarray:
 
 def pose_at(yaw: float) -> np.ndarray:
     """A camera of the arch frame."""
-    return arch_scene.photograph(arch_scene.patient(1), yaw)[1]
+    return dental_patient.photograph(dental_patient.patient(1), yaw)[1]
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,14 +131,14 @@ def test_nearest_similarity_undoes_a_change_of_world() -> None:
 
 
 def test_teeth_are_named_before_known_cameras_whatever_their_world() -> None:
-    dentitions, poses, teeth = arch_scene.three(rolls=(0, 0.07, -0.05))
+    dentitions, poses, teeth = dental_patient.three(rolls=(0, 0.07, -0.05))
     images = [np.full((*d.mask.shape, 3), 0.5, np.float32) for d in dentitions]
     result = fit_arch(
         dentitions, images, [np.ones(d.mask.shape, bool) for d in dentitions],
         [950.0] * 3, ArchOptions(dense_rounds=0, rows_tried=8), 1, lambda *_: None,
         cameras=[in_world(pose) for pose in poses],
     )  # fmt: skip
-    assert arch_scene.rotation_errors(result, poses) == pytest.approx([0, 0], abs=1e-4)
+    assert dental_patient.rotation_errors(result, poses) == pytest.approx([0, 0], abs=1e-4)
     assert [(view.upper, view.lower) for view in result.views] == teeth
     assert [view.role for view in result.views] == ["right", "frontal", "left"]
 

@@ -25,8 +25,14 @@ from stages.init.dental.numbering.sightings import seen_rows
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.template import position_of
 from stages.init.stage import InitStage
-from tests.stages.mouth_case import WIDTH, Case, mouth_case, relative_errors, true_numbers
-from tests.stages.test_teeth_mouths import wrong_numbers
+from tests.stages.mouth_case import (
+    WIDTH,
+    Case,
+    mouth_case,
+    relative_errors,
+    true_numbers,
+    wrong_numbers,
+)
 
 ARCH = {"arch_power": 2.5, "arch_width": 1.04, "size": 1.0}
 #: The numbers of these mouths are easily found: a short search is enough.

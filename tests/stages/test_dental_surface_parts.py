@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.chart.crown_shape import crown_points, crown_radius, jaw_shape
 from stages.init.dental.surface.chart.grid import (
@@ -28,30 +27,11 @@ from stages.init.dental.surface.colour import (
 )
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo, find_gum
+from stages.init.dental.surface.photo import find_gum
 from stages.init.dental.surface.sweep import choose_pairs, matching_cost
+from tests.stages.dental_surface_case import photo, row_of_teeth
 
 GRID = ChartGrid(left=-20.0, top=5.0, density=4.0, shape=(41, 161))
-
-
-def photo(yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0) -> Photo:
-    a = np.radians(yaw)
-    toward = np.array([np.sin(a), 0, np.cos(a)])
-    rotation = np.stack([[np.cos(a), 0, -np.sin(a)], [0, -1, 0], -toward])
-    translation = -rotation @ (100 * toward)
-    camera = np.array(
-        [*rotation.ravel(), *translation, 150.0, size[1] / 2, size[0] / 2], np.float64
-    )
-    rng = np.random.default_rng(seed)
-    plain = np.zeros(size, np.float32)
-    return Photo(
-        index=0, camera=camera, size=size, density=1.5,
-        image=np.zeros((*size, 3), np.float32),
-        texture=rng.normal(size=size).astype(np.float32),
-        upper=plain, lower=plain, upper_gum=plain, lower_gum=plain, dull=plain + 1,
-        void=plain,
-        valid=np.ones(size, bool),
-    )  # fmt: skip
 
 
 def test_chart_of_a_cylinder() -> None:
@@ -105,26 +85,6 @@ def test_grid_holds_its_points() -> None:
         values[: (finer.shape[0] + 1) // 2, : (finer.shape[1] + 1) // 2],
         atol=1e-2,
     )
-
-
-def row_of_teeth() -> dict[Landmark, np.ndarray]:
-    """Flat upper crowns 13 to 23 on a circle of 26 mm, 7 mm wide and 9 mm high."""
-    marks = {}
-    teeth = (13, 12, 11, 21, 22, 23)
-
-    def at(angle: float, y: float, inward: float) -> np.ndarray:
-        r = 26 - inward
-        return np.array([r * np.sin(angle), y, r * np.cos(angle) - AXIS_DEPTH])
-
-    for k, tooth in enumerate(teeth):
-        angle = (k - 2.5) * 0.27
-        marks[Landmark("zenith", tooth)] = at(angle, 9, 0)
-        marks[Landmark("tip", tooth)] = at(angle, 0, 0)
-        if k < 5:
-            pair = (tooth, teeth[k + 1])
-            marks[Landmark("papilla", *pair)] = at(angle + 0.135, 5, 1.5)
-            marks[Landmark("embrasure", *pair)] = at(angle + 0.135, 1.5, 1.5)
-    return marks
 
 
 def test_crowns_bulge_between_their_landmarks() -> None:

@@ -12,7 +12,7 @@ from stages.fit import backend
 from stages.fit.stage import FitStage
 from stages.splatting.card import rasterize_on_card
 from stages.splatting.rasterizer import Viewpoint, rasterize
-from tests.stages.test_fit_light import case, context
+from tests.stages.lit_fit_case import case, context
 
 #: what runs on a card, with torch on the processor and our kernels in gsplat's place
 STAND_IN = partial(rasterize_on_card, device="cpu", backend="cpu")

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from pipeline.config import Config, load_config, result_fields
 from stages.fit.config import PARTS, FitConfig, FitSettings, PartName, resolve
 from stages.fit.stage import FitStage
-from tests.stages.test_fit_trainer import case, context
+from tests.stages.fit_case import case, context
 
 BASELINES = ("3dgs", "instantsplat", "cf3dgs")
 ABLATIONS = {
@@ -128,5 +128,5 @@ def test_a_preset_runs(tmp_path, name: str) -> None:
                "initial_points": 1500, "progressive_pose_iterations": 5}  # fmt: skip
     here = context(tmp_path, views, cameras, points, **values)
     FitStage().run(here)
-    assert here.figures["gaussians"] > 100
-    assert here.figures["train_psnr"] > 8
+    assert (here.figures["gaussians"] > 2000) == (name != "instantsplat")  # which never splits
+    assert here.figures["train_psnr"] > 14  # 15.3 to 22.5 when this was written; 12.9 on the way

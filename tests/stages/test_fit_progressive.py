@@ -18,7 +18,7 @@ from stages.fit.parts.progressive import next_pose
 from stages.fit.stage import FitStage
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack
-from tests.stages.test_fit_trainer import StoppedError, case, context, looking, outputs, surface
+from tests.stages.fit_case import StoppedError, case, context, looking, outputs, surface
 
 PLAIN = {
     "light": "none", "hold_surface": False, "lambda_flow": 0.0, "lambda_depth": 0.0,

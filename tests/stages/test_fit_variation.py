@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from pipeline.artifacts.views import View, Views
 from stages.fit.numerics.total_variation import TotalVariation
 from stages.fit.stage import FitStage
-from tests.stages.test_fit_light import case, context
+from tests.stages.lit_fit_case import case, context
 
 WEIGHT, NEIGHBOURS, TOLERANCE, UNIT = 0.7, 5, 0.05, 0.3
 

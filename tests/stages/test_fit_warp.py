@@ -15,7 +15,7 @@ from pipeline.artifacts.views import View, Views
 from stages.fit.numerics.spline_field import SplineField
 from stages.fit.numerics.surface import Warp, turned
 from stages.fit.stage import FitStage
-from tests.stages.test_fit_light import bump, case, context, lit_image
+from tests.stages.lit_fit_case import bump, case, context, lit_image
 
 SPACING = 0.1
 

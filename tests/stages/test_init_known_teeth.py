@@ -11,7 +11,7 @@ from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
 from stages.init.dental import place_known
 from stages.init.stage import InitStage
-from tests.stages.test_init_teeth import FOCAL, SIZE, found_teeth, read_teeth, side_pose
+from tests.stages.init_teeth_case import FOCAL, SIZE, found_teeth, read_teeth, side_pose
 from tests.teeth_case import write
 
 UNIT = 0.02  # of the cameras' world per mm of the arch

@@ -10,7 +10,7 @@ import torch
 
 from stages.splatting import torch_api
 from stages.splatting.torch_api import rasterization
-from tests.stages.test_splatting_torch import HEIGHT, WIDTH, inputs, sure_pixels
+from tests.stages.splatting_case import HEIGHT, WIDTH, inputs, sure_pixels
 
 gsplat = pytest.importorskip("gsplat")
 formulas = pytest.importorskip("gsplat.cuda._torch_impl")

@@ -12,7 +12,7 @@ from stages.dentition.crowns import dentition_of
 from stages.dentition.tooth_rows import ChainOptions
 from stages.teeth.choose import ChoiceOptions, choose, chroma, layout_distance
 from stages.teeth.read import Reading, numbered, row_extent
-from tests.stages.test_teeth_crowns import SIZE, mouth
+from tests.stages.crowns_case import SIZE, mouth
 
 FIRST = {"upper": 14, "lower": 43}
 ROWS = {"upper": (14, 13, 12, 11, 21, 22, 23), "lower": (43, 42, 41, 31, 32, 33)}

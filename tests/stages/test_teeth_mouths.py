@@ -21,15 +21,20 @@ from stages.init.dental.reconstruct import with_numbers
 from stages.init.dental.solution import ArchFit
 from stages.init.stage import InitStage
 from stages.teeth.reader import read_photographs
-from tests.stages.mouth_case import Case, mouth_case, relative_errors, true_numbers
+from tests.stages.mouth_case import (
+    DOUBTED,
+    Case,
+    mouth_case,
+    relative_errors,
+    true_numbers,
+    wrong_numbers,
+)
 
 #: An arch as wide in front as the textbook's; with a narrower one the angles come out too small.
 ARCH = {"arch_power": 2.5, "arch_width": 1.04, "size": 1.0}
 #: Degrees by which the rotation from one photograph to another may be off, by landmarks alone: the
 #: patient's arch is not known.
 LANDMARKS_ALONE = 8.0
-#: A wrong number is none if this much doubt is said beside it.
-DOUBTED = 0.05
 
 MOUTHS = {
     "normal": (10, ARCH),
@@ -52,20 +57,6 @@ def fitted(photographed: Case, dentitions: list[Dentition], rows_tried: int = 8)
         list(dentitions), [view.image for view in views], [view.valid() for view in views],
         [None] * len(views), ArchOptions(dense_rounds=0, rows_tried=rows_tried), 1, lambda *_: None,
     )  # fmt: skip
-
-
-def wrong_numbers(photographed: Case, numbered: list[Dentition]) -> tuple[list[str], float]:
-    """What has a wrong number without a doubt, and the share of the crowns named right."""
-    wrong, right, total = [], 0, 0
-    for photo, dentition in zip(photographed.photos, numbered, strict=True):
-        truth = true_numbers(photo, dentition)
-        for jaw in JAWS:
-            for crown, true in zip(dentition.crowns(jaw), truth[jaw], strict=True):
-                total += 1
-                right += crown.number == true
-                if crown.number not in (0, true) and crown.doubt < DOUBTED:
-                    wrong.append(f"{dentition.kind}: {true} was named {crown.number}")
-    return wrong, right / total
 
 
 def named(dentitions: list[Dentition], fit: ArchFit) -> list[Dentition]:

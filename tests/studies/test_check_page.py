@@ -20,8 +20,8 @@ from stages.dentition.corrections import apply_corrections
 from stages.dentition.crowns import mirrored_dentition
 from tests import teeth_case as case
 from tests.browser import browse, console, needs_chromium
-from tests.report_case import write_result
-from tests.report_page import assert_alone, text_of
+from tests.studies.report_case import write_result
+from tests.studies.report_page import assert_alone, text_of
 
 
 def doubtful_case(folder: Path, teeth: Teeth | None = None, failure: str = "Doubtful.") -> Path:

@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
+
 import toy
 from toy import Numbers, ToyEntryPoint
 

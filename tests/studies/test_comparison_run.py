@@ -21,9 +21,9 @@ from stages.align.stage import AlignStage
 from stages.init.config import InitConfig
 from stages.init.stage import InitStage
 from stages.swap.stage import SwapConfig, SwapStage
-from tests import report_case as case
-from tests.report_page import text_of
-from tests.stages.comparison_scene import SAMPLES, moved, true_cameras, true_points, write_model
+from tests.studies import report_case as case
+from tests.studies.comparison_scene import SAMPLES, moved, true_cameras, true_points, write_model
+from tests.studies.report_page import text_of
 
 SETTINGS = {
     "views.long_side": 192, "init.cameras": str(SAMPLES / "transforms.json"), "fit.iterations": 20,

@@ -21,9 +21,9 @@ from pipeline.runner import RunSummary
 from pipeline.studies.report import run_report
 from stages.evaluate.images.pictures import comparison
 from stages.flow.report import flow_colors
-from tests import report_case as case
 from tests.browser import browse, needs_chromium
-from tests.report_page import assert_alone, look, text_of
+from tests.studies import report_case as case
+from tests.studies.report_page import assert_alone, look, text_of
 
 
 def sections_of(page: str) -> list[str]:

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import toy_bench
 import yaml
 
 import pipeline
 from pipeline.artifacts import KINDS
 from pipeline.errors import RequestError
 from pipeline.stage import get_stage
+from tests.studies import toy_bench
 
 SUITE: dict[str, Any] = {
     "title": "Toys",

@@ -23,7 +23,7 @@ from pipeline.studies.compare.colmap_run import (
 )
 from pipeline.studies.compare.models import read_largest
 from stages.views.orientation import make_upright, upright_from_stored
-from tests.stages.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
+from tests.studies.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 
 IDENTITY = (1.0, np.eye(3), np.zeros(3))
 

@@ -13,9 +13,9 @@ from pipeline.studies.benchmark.report import benchmark_report, charts, grid_tab
 from pipeline.studies.benchmark.suite import Suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
 from stages.evaluate.images.pictures import comparison
-from tests import report_case as case
 from tests.browser import needs_chromium
-from tests.report_page import assert_alone, look, text_of
+from tests.studies import report_case as case
+from tests.studies.report_page import assert_alone, look, text_of
 
 SUITE = {
     "title": "Ours <b>&",
