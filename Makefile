@@ -13,7 +13,7 @@ demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
 
 test: system chromium .venv/installed-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
