@@ -121,7 +121,9 @@ def test_cameras_stay_as_given_and_the_surface_lies_before_them(tmp_path, monkey
         np.testing.assert_allclose(
             pair.points_i[known][:, 0], (u + 0.5 - camera.cx) / camera.fx * depth, atol=1e-6
         )
-        assert np.all(v >= 0)
+        np.testing.assert_allclose(
+            pair.points_i[known][:, 1], (v + 0.5 - camera.cy) / camera.fy * depth, atol=1e-6
+        )
 
 
 def test_doubtful_teeth_fall_back_to_the_sweep_with_a_word(tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ def test_every_cell_came_out(results: dict[str, Any]) -> None:
     for cell in results["cells"]:
         assert cell["status"] == "done", cell.get("reason")
         assert cell["registered"] == cell["total"]
-        assert cell["seconds"] > 0 and cell["peak_memory_mb"] > 50
+        assert cell["peak_memory_mb"] > 50
         assert cell["poses"]["rotation_deg"]["median"] < 3
         assert cell["figures"]["input"]["psnr"] > 15
 

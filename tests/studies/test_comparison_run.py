@@ -63,7 +63,9 @@ def test_the_whole_comparison(workspace, model):
     fits = {row["start"]: row for row in found.figures["fits"]}
     assert len(fits) == 3 and not any("failure" in row for row in fits.values())
     assert {row["iterations"] for row in fits.values()} == {20}
-    assert all(row["psnr"] > 10 for row in fits.values())
+    # 17.8, 19.0 and 14.8 when this was written; COLMAP's few points start a fit worst
+    assert all(row["psnr"] > 13.5 for row in fits.values())
+    assert min(fits, key=lambda start: fits[start]["psnr"]) == "COLMAP's cameras and points"
     ours = json.loads(next(workspace.glob("evaluate/*/metrics/metrics.json")).read_text())
     assert fits["this pipeline"]["psnr"] == ours["mean"]["psnr"]
     assert json.loads((found.folder / "comparison.json").read_text()) == found.figures
