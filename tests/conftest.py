@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,11 @@ def short_settings() -> dict[str, int]:
 
 @pytest.fixture(scope="session")
 def sample_run(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    """The whole job on the three sample photographs, with a short fit."""
-    folder = tmp_path_factory.mktemp("case") / "w"
-    return pipeline.run(SAMPLES, workspace=folder, overrides=SHORT)
+    """The whole job on the three sample photographs, with a short fit; not to be changed.
+
+    Processes that test beside each other share it: one computes a stage, the others wait for it.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    return pipeline.run(SAMPLES, workspace=folder / "sample_run", overrides=SHORT)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -65,12 +66,14 @@ def test_nothing_exported_names_the_source_files(done: RunSummary) -> None:
 
 
 def test_second_run_is_cached_and_a_setting_reruns_only_what_depends_on_it(
-    done: RunSummary, short_settings: dict[str, int]
+    done: RunSummary, short_settings: dict[str, int], tmp_path: Path
 ) -> None:
+    workspace = shutil.copytree(done.workspace, tmp_path / "w", symlinks=True)
+
     def actions(*overrides: str, **options: object) -> dict[str, str]:
         settings = [f"{key}={value}" for key, value in short_settings.items()] + ["report=false"]
         summary = pipeline.run(
-            SAMPLES, workspace=done.workspace, overrides=[*settings, *overrides], **options
+            SAMPLES, workspace=workspace, overrides=[*settings, *overrides], **options
         )  # type: ignore[arg-type]
         return {stage.name: stage.action for stage in summary.stages}
 
@@ -82,7 +85,7 @@ def test_second_run_is_cached_and_a_setting_reruns_only_what_depends_on_it(
     assert changed == {
         "views": "cached", "teeth": "cached", "init": "cached", "sap": "ran", "fit": "ran",
     }  # fmt: skip
-    states = {s.name: s for s in pipeline.status(workspace=done.workspace)}
+    states = {s.name: s for s in pipeline.status(workspace=workspace)}
     assert states["sap"].reasons == ["sap.quantile 0.999 → 0.99"]
     assert states["fit"].reasons == ["input points (from sap) changed"]
     assert set(actions(short, **chain).values()) == {"cached"}
