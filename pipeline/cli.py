@@ -157,11 +157,20 @@ def status_command(
 
 
 @app.command("report")
-def report_command(workspace: Workspace = None) -> None:
+def report_command(
+    workspace: Workspace = None,
+    anonymous: Annotated[
+        bool,
+        typer.Option(
+            "--anonymous",
+            help="Write report_anonymous.html, without names and dates, to be passed on.",
+        ),
+    ] = False,
+) -> None:
     """Write WORKSPACE/report.html: what came out, how sure it is, and everything behind it."""
     from pipeline.studies.report import run_report
 
-    print(run_report(workspace or _only_workspace()))
+    print(run_report(workspace or _only_workspace(), anonymous=anonymous))
 
 
 @app.command("stages")
