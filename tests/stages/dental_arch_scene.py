@@ -17,7 +17,7 @@ from pipeline.artifacts.teeth import Crown, Dentition
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 
-#: The arches curve around (0, y, -AXIS). This anatomy is none that the code assumes: a narrower arch
+#: The arches curve around (0, y, -AXIS). It is no anatomy that the code assumes: a narrower arch
 #: (its charts lie around 26), flatter crowns (2.6) and a camera further away (125 mm).
 AXIS = 24.0
 BULGE = 2.1
