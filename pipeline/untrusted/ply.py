@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.errors import RequestError
 from pipeline.untrusted.files import Kind, UnusableFile, read
 from pipeline.untrusted.numerals import numbers_in
 
 Array = npt.NDArray[Any]
+#: Ten million Gaussians of 62 numbers.
+CLOUD = Kind("a cloud of points or Gaussians", 5 << 29)
 #: Of a property: its type, or those of a list's length and of its values.
 Type = str | tuple[str, str]
 
@@ -76,6 +79,27 @@ def read_ply(path: Path, kind: Kind) -> dict[str, Element]:
             f"is longer than its header says: {body.end - body.at} {body.unit} are left over"
         )
     return found
+
+
+def read_cloud(path: Path, needed: Iterable[str]) -> Mapping[str, Array]:
+    """The columns of a cloud of points or Gaussians: property -> [N].
+
+    Args:
+        needed: properties that it must have.
+
+    Raises:
+        RequestError: it can't be read, is damaged, or lacks one of them.
+    """
+    try:
+        vertex = read_ply(path, CLOUD).get("vertex")
+    except UnusableFile as error:
+        raise RequestError(f"{path} {error}. Write it again.") from error
+    missing = [name for name in needed if vertex is None or name not in vertex.columns]
+    if vertex is None or missing:
+        raise RequestError(
+            f"{path} has no vertices with {', '.join(missing)}. Give a .ply with these properties."
+        )
+    return vertex.columns
 
 
 def _header(data: bytes) -> tuple[str, list[_Declared], int]:

@@ -13,11 +13,13 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from pipeline.artifacts.gaussians import read_gaussians_ply
+from pipeline.artifacts.points import Points
 from pipeline.errors import RequestError
 from pipeline.geometry.mesh import Mesh
-from pipeline.untrusted.files import MESH, UnusableFile
+from pipeline.untrusted.files import MESH
 from pipeline.untrusted.meshes import read_mesh
-from pipeline.untrusted.ply import read_ply
+from pipeline.untrusted.ply import read_cloud
 
 SETTING = "evaluate.mesh"
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
@@ -296,11 +298,15 @@ def test_memory_is_bounded_by_the_file(
 def test_splats_and_clouds_are_read_by_the_same_reader(tmp_path: Path) -> None:
     path = tmp_path / "points.ply"
     path.write_bytes(ply())
-    found = read_ply(path, MESH)
-    assert found["vertex"].columns["red"].tolist() == [7] * 4
+    assert read_cloud(path, "xyz")["red"].tolist() == [7] * 4
+    with pytest.raises(RequestError, match=r"points\.ply has no vertices with f_dc_0, f_dc_1"):
+        read_gaussians_ply(path)
+    with pytest.raises(RequestError, match=r"points\.ply has no vertices with nx, ny, nz, green"):
+        Points.load(tmp_path)
     path.write_bytes(ply()[:-20])
-    with pytest.raises(UnusableFile, match="cut off"):
-        read_ply(path, MESH)
+    for reader in (read_gaussians_ply, lambda at: Points.load(at.parent)):
+        with pytest.raises(RequestError, match=r"points\.ply is cut off"):
+            reader(path)
 
 
 def test_a_mesh_beyond_the_limit_is_not_read(tmp_path: Path) -> None:
