@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
 from pipeline.files import read_json, write_json
-from pipeline.untrusted.ply import read_cloud
+from pipeline.untrusted.scenes.ply import read_cloud
 
 Array = npt.NDArray[np.float32]
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
-from pipeline.untrusted.ply import read_cloud
+from pipeline.untrusted.scenes.ply import read_cloud
 
 Array = npt.NDArray[np.float32]
 

@@ -18,8 +18,8 @@ from pipeline.artifacts.points import Points
 from pipeline.errors import RequestError
 from pipeline.geometry.mesh import Mesh
 from pipeline.untrusted.files import MESH
-from pipeline.untrusted.meshes import read_mesh
-from pipeline.untrusted.ply import read_cloud
+from pipeline.untrusted.scenes.meshes import read_mesh
+from pipeline.untrusted.scenes.ply import read_cloud
 
 SETTING = "evaluate.mesh"
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
@@ -257,7 +257,7 @@ _MEASURE = """
 import resource, sys
 from pathlib import Path
 from pipeline.untrusted.files import UnusableFile
-from pipeline.untrusted.meshes import read_mesh
+from pipeline.untrusted.scenes.meshes import read_mesh
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 try:
     read_mesh(Path(sys.argv[1]))

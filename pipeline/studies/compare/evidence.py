@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.geometry.models.colmap import quiet_pycolmap
+from pipeline.untrusted.scenes.colmap import read_model
 
 Pair = tuple[str, str]
 #: COLMAP numbers a pair of images by id1 * this + id2.
@@ -216,12 +217,7 @@ def why_left_out(
 
 def mapped_keypoints(model: Path) -> dict[str, npt.NDArray[np.bool_]]:
     """For each registered image of a model: which of its keypoints observe a point."""
-    read = quiet_pycolmap().Reconstruction(str(model))
-    return {
-        image.name: np.array([point.has_point3D() for point in image.points2D], bool)
-        for image in read.images.values()
-        if image.has_pose
-    }
+    return {image.name: image.has_point for image in read_model(model).images.values()}
 
 
 def renamed(evidence: Evidence, labels: Mapping[str, str]) -> Evidence:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.untrusted.files import MESH, UnusableFile, read
-from pipeline.untrusted.ply import read_ply
+from pipeline.untrusted.scenes.ply import read_ply
 
 Vertices = npt.NDArray[np.float64]
 Triangles = npt.NDArray[np.uint32]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from pipeline.errors import RequestError
 from pipeline.untrusted.files import Kind, UnusableFile, read
-from pipeline.untrusted.numerals import numbers_in
+from pipeline.untrusted.scenes.numerals import numbers_in
 
 Array = npt.NDArray[Any]
 #: Ten million Gaussians of 62 numbers.
