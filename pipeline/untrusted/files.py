@@ -70,11 +70,12 @@ def opened(path: Path, kind: Kind) -> Iterator[BinaryIO]:
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         reason = getattr(error, "strerror", None) or str(error)
         raise UnusableFile(f"can't be read ({reason})") from error
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode):  # before fdopen, which has errors of its own for folders
+        os.close(descriptor)
+        sort = next((name for is_sort, name in _SORTS if is_sort(found.st_mode)), "no file")
+        raise UnusableFile(f"is {sort}, not a file")
     with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            sort = next((name for is_sort, name in _SORTS if is_sort(found.st_mode)), "no file")
-            raise UnusableFile(f"is {sort}, not a file")
         if found.st_size > kind.most_bytes:
             raise UnusableFile(
                 f"has {found.st_size / 1e6:,.0f} MB, more than {kind.name} may have "

@@ -132,6 +132,8 @@ def _binary_rows(file: str, data: bytes, at_least: int) -> Iterator[Row]:
 
 #: `# Number of images: 3, mean ...`
 _SAID = re.compile(rb"#\s*Number of \w+ ?\w*: (\d{1,18})\b")
+#: The first words of a file that COLMAP wrote.
+_TITLE = re.compile(rb"# ?(Camera|Image|3D point|Rig|Frame)")
 _WHOLE = re.compile(rb"-?\d{1,20}")
 _RANGES = {"I": 2**32, "Q": 2**64, "B": 2**8}
 
@@ -216,6 +218,8 @@ def _text_rows(file: str, data: bytes) -> Iterator[Row]:
         yield row
         if row.rest.strip():
             raise row.wrong("the line is too long")
+    if said is None and not count and _TITLE.match(data):
+        raise UnusableFile(f"can't be read: {file} is cut off in its first lines")
     if said is not None and said != count:
         raise UnusableFile(
             f"can't be read: {file} is cut off or damaged: it says {said} in its comment, and "
