@@ -11,8 +11,8 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
 from pipeline.untrusted.files import UnusableFile
-from pipeline.untrusted.scenes.meshes import read_mesh
 from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.scenes.meshes import read_mesh
 
 Array = npt.NDArray[np.float64]
 

@@ -50,9 +50,7 @@ def read_arrays(path: Path, wanted: Iterable[str]) -> tuple[dict[str, Array], li
             with zipfile.ZipFile(file) as archive:
                 entries = _entries(archive, size)
                 found = {
-                    name: _array(archive, entries[name], name)
-                    for name in wanted
-                    if name in entries
+                    name: _array(archive, entries[name], name) for name in wanted if name in entries
                 }
         except (zipfile.BadZipFile, zlib.error, EOFError, OSError, struct.error) as error:
             raise UnusableFile(f"can't be read as .npz ({error})") from error
@@ -90,12 +88,12 @@ def _entries(archive: zipfile.ZipFile, size: int) -> Mapping[str, zipfile.ZipInf
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
         if name in found:
-            raise UnusableFile(f"holds the array {ascii(name[:40])} twice")
+            raise UnusableFile(f"holds the array {name[:40]!a} twice")
         if entry.flag_bits & 0x1:
-            raise UnusableFile(f"holds the array {ascii(name[:40])} encrypted")
+            raise UnusableFile(f"holds the array {name[:40]!a} encrypted")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise UnusableFile(
-                f"holds the array {ascii(name[:40])} packed as no .npz is (way "
+                f"holds the array {name[:40]!a} packed as no .npz is (way "
                 f"{entry.compress_type}); write it with numpy.savez"
             )
         stored = entry.compress_type == zipfile.ZIP_STORED
@@ -103,7 +101,7 @@ def _entries(archive: zipfile.ZipFile, size: int) -> Mapping[str, zipfile.ZipInf
             entry.header_offset + entry.compress_size > size
         ):
             raise UnusableFile(
-                f"is damaged: its list says that the array {ascii(name[:40])} has "
+                f"is damaged: its list says that the array {name[:40]!a} has "
                 f"{entry.compress_size} bytes, which are not there"
             )
         found[name] = entry
@@ -128,16 +126,17 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Array
         expected = entry.file_size - stream.tell()
         if size != expected:
             raise UnusableFile(
-                f"is damaged: the array {ascii(name)} says that it has {size} bytes, and "
+                f"is damaged: the array {name!a} says that it has {size} bytes, and "
                 f"{expected} are there"
             )
         data = bytearray(size)
         view, done = memoryview(data), 0
         while done < size:
-            step = stream.readinto(view[done : done + (1 << 20)])
-            if not step:
-                raise UnusableFile(f"is cut off in the array {ascii(name)}")
-            done += step
+            piece = stream.read(min(size - done, 1 << 20))
+            if not piece:
+                raise UnusableFile(f"is cut off in the array {name!a}")
+            view[done : done + len(piece)] = piece
+            done += len(piece)
         stream.read(1)  # the end of the entry, where its checksum is compared
     values = np.frombuffer(data, dtype, count)
     return values.reshape(shape, order="F" if fortran else "C")
@@ -148,22 +147,24 @@ def _header(stream: IO[bytes], name: str) -> tuple[np.dtype[Any], tuple[int, ...
     magic = stream.read(8)
     lengths = {b"\1\0": "<H", b"\2\0": "<I", b"\3\0": "<I"}
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in lengths:
-        raise UnusableFile(f"holds {ascii(name[:40])}, which is no array of numpy's")
+        raise UnusableFile(f"holds {name[:40]!a}, which is no array of numpy's")
     form = lengths[magic[6:]]
     (length,) = struct.unpack(form, stream.read(struct.calcsize(form)))
     text = stream.read(min(length, 10_000)).decode("latin-1")
     match = _HEADER.fullmatch(text)
     if match is None or length > 10_000:
         raise UnusableFile(
-            f"can't be read: the array {ascii(name[:40])} is of a type that is not taken (objects "
-            f"and fields are not): {ascii(text[:60])}"
+            f"can't be read: the array {name[:40]!a} is of a type that is not taken (objects "
+            f"and fields are not): {text[:60]!a}"
         )
     order, kind, size, fortran, shape = match.groups()
     try:
         dtype = np.dtype(f"{order}{kind}{size}")
     except TypeError:
-        raise UnusableFile(f"can't be read: the array {ascii(name[:40])} is of an unknown type") from None
+        raise UnusableFile(
+            f"can't be read: the array {name[:40]!a} is of an unknown type"
+        ) from None
     lengths_of = tuple(int(part) for part in shape.replace(" ", "").split(",") if part)
     if len(lengths_of) > 8 or dtype.itemsize == 0:
-        raise UnusableFile(f"can't be read: the shape of the array {ascii(name[:40])} is not taken")
+        raise UnusableFile(f"can't be read: the shape of the array {name[:40]!a} is not taken")
     return dtype, lengths_of, fortran == "True"

@@ -56,5 +56,5 @@ def _pairs(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        raise UnusableFile(f"says {ascii(twice[:40])} twice")
+        raise UnusableFile(f"says {twice[:40]!a} twice")
     return found

@@ -125,7 +125,9 @@ def read_evidence(path: Path) -> Evidence:
             inliers[names[first], names[second]] = matched
         strangers = sorted(set(camera_of.values()) - set(lenses))
         if strangers:
-            raise sqlite3.DatabaseError(f"its images name the camera {strangers[0]}, which it lacks")
+            raise sqlite3.DatabaseError(
+                f"its images name the camera {strangers[0]}, which it lacks"
+            )
     return Evidence(
         keypoints=keypoints,
         inliers=inliers,

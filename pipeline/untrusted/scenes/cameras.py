@@ -74,9 +74,9 @@ def check_lens(lens: Lens, whose: str) -> None:
     Raises:
         UnusableFile: naming the field.
     """
-    for field, value in (("width", lens.width), ("height", lens.height)):
-        if not 1 <= value <= MOST_PIXELS:
-            raise _wrong(whose, field, value, f"from 1 to {MOST_PIXELS} pixels are possible")
+    for field, pixels in (("width", lens.width), ("height", lens.height)):
+        if not 1 <= pixels <= MOST_PIXELS:
+            raise _wrong(whose, field, pixels, f"from 1 to {MOST_PIXELS} pixels are possible")
     side = max(lens.width, lens.height)
     names = LENSES[lens.model][1]
     for field, value in zip(names, lens.parameters, strict=True):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.scenes.cameras import (
     FARTHEST,
     LENSES,
@@ -23,7 +24,6 @@ from pipeline.untrusted.scenes.cameras import (
     check_lens,
     check_quaternion,
 )
-from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.scenes.colmap_rows import Row, rows_of, shown
 
 Array = npt.NDArray[np.float64]
@@ -145,16 +145,16 @@ def _framed(
     for number, frame in frames.items():
         if frame.rig not in rigs:
             raise UnusableFile(f"holds a frame {number} of the rig {frame.rig}, which is not there")
-        for sensor, image in frame.images:
+        for sensor, taken in frame.images:
             if sensor[0] != _SENSORS["CAMERA"]:
                 continue
-            if image in found:
-                raise UnusableFile(f"holds two frames ({found[image]}, {number}) of image {image}")
-            found[image] = number
-            if image in images and images[image].camera != sensor[1]:
+            if taken in found:
+                raise UnusableFile(f"holds two frames ({found[taken]}, {number}) of image {taken}")
+            found[taken] = number
+            if taken in images and images[taken].camera != sensor[1]:
                 raise UnusableFile(
-                    f"holds a frame {number} in which image {image} is by camera {sensor[1]}, and "
-                    f"images say {images[image].camera}"
+                    f"holds a frame {number} in which image {taken} is by camera {sensor[1]}, and "
+                    f"images say {images[taken].camera}"
                 )
     for number, image in images.items() if frames or rigs else ():
         if number not in found:

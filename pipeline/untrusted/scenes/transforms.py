@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.untrusted.files import CAMERA_LIST, UnusableFile
+from pipeline.untrusted.plain_json import read_plain_json
 from pipeline.untrusted.scenes.cameras import (
     MOST_PIXELS,
     Array,
@@ -17,8 +19,6 @@ from pipeline.untrusted.scenes.cameras import (
     check_lens,
     check_pose,
 )
-from pipeline.untrusted.files import CAMERA_LIST, UnusableFile
-from pipeline.untrusted.plain_json import read_plain_json
 
 #: OpenGL cameras (y up, z back), which `transforms.json` holds, to OpenCV cameras.
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
