@@ -88,15 +88,17 @@ def read(path: Path, kind: Kind) -> bytes:
     """All bytes of a file of the user's.
 
     Raises:
-        UnusableFile: as `opened`, or it grew beyond its kind's limit while it was read.
+        UnusableFile: as `opened`, or it grew while it was read.
     """
     with opened(path, kind) as file:
         try:
-            data = file.read(kind.most_bytes + 1)
+            # As many as are there: memory is taken for all that are asked for.
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)
         except OSError as error:
             raise UnusableFile(f"can't be read ({error.strerror or error})") from error
-    if len(data) > kind.most_bytes:
-        raise UnusableFile(f"has more bytes than {kind.name} may have ({kind.most_bytes:,})")
+    if len(data) > size:
+        raise UnusableFile(f"grew while it was read (it had {size:,} bytes)")
     return data
 
 
