@@ -53,10 +53,10 @@ def read_arrays(path: Path, wanted: Iterable[str]) -> tuple[dict[str, Array], li
                     name: _array(archive, entries[name], name) for name in wanted if name in entries
                 }
         except (zipfile.BadZipFile, zlib.error, EOFError, OSError, struct.error) as error:
-            raise UnusableFile(f"can't be read as .npz ({error})") from error
+            raise UnusableFile(f"can't be read as .npz ({str(error)[:100]})") from error
         # Features of zip that numpy has no use for, and what zipfile trips over.
         except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-            raise UnusableFile(f"is no .npz as numpy writes it ({error})") from error
+            raise UnusableFile(f"is no .npz as numpy writes it ({str(error)[:100]})") from error
     return found, sorted(entries)
 
 

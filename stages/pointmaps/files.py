@@ -103,7 +103,11 @@ def match_names(files: Sequence[Path], views: Sequence[View], meaning: str) -> l
         best = max(attempts.values(), key=lambda found: sum(one is not None for one in found))
         worst = best.index(None)
         given = stated[worst]
-        what = f"the names {given[0]} and {given[1]}" if given else "no names, and its file name"
+        what = (
+            f"the names {given[0][:80]} and {given[1][:80]}"
+            if given
+            else "no names, and its file name"
+        )
         allowed = sorted({name for known in keys.values() for name in known})
         near = nearest(given[0], allowed) if given else ""
         raise RequestError(

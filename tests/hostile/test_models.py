@@ -277,6 +277,16 @@ def test_a_damaged_database_is_said_to_be(tmp_path: Path, statement: str, words:
         read_evidence(path)
 
 
+def test_a_schema_that_is_no_text_is_said_to_be_damaged(tmp_path: Path) -> None:
+    path = _database(tmp_path / "database.db")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"CREATE TABLE keypoints")
+    data[at + 13 : at + 16] = b"\xff\xfe\xfd"
+    path.write_bytes(data)
+    with pytest.raises(sqlite3.Error):
+        read_evidence(path)
+
+
 def test_a_database_that_never_ends_is_given_up(tmp_path: Path) -> None:
     endless = (
         "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "

@@ -66,6 +66,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         target = sqlite3.connect(Path(scratch) / "database.db")
         try:
             source.backup(target)
+            target.text_factory = lambda text: text.decode(errors="replace")
             # A schema is a program too: views and expressions of others are not run for long.
             target.execute("PRAGMA trusted_schema = OFF")
             target.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
@@ -74,6 +75,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
                 if name not in tables:
                     raise sqlite3.DatabaseError(f"it has no table {name}")
             yield target
+        except UnicodeDecodeError as error:  # also of SQLite's own message about the schema
+            raise sqlite3.DatabaseError("it holds names that are no text") from error
         finally:
             source.close()
             target.close()

@@ -104,18 +104,21 @@ def check_pose(cam_from_world: Array, whose: str, field: str) -> None:
         UnusableFile: saying what it is instead.
     """
     rotation, shift = cam_from_world[:3, :3], cam_from_world[:3, 3]
-    if not np.isfinite(cam_from_world).all():
+    with np.errstate(all="ignore"):
+        _check_rigid(rotation, shift, whose, field)
+
+
+def _check_rigid(rotation: Array, shift: Array, whose: str, field: str) -> None:
+    if not (np.isfinite(rotation).all() and np.isfinite(shift).all()):
         raise _wrong(whose, field, "not finite", "each entry must be a number")
     if not np.abs(rotation.T @ shift).max() <= FARTHEST:
         raise _wrong(whose, field, f"{np.abs(shift).max():.3g} away", f"at most {FARTHEST:g}")
-    with np.errstate(all="ignore"):
-        off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-        turned = np.linalg.det(rotation)
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not off <= SLACK:
         sizes = " ".join(f"{size:.4g}" for size in np.linalg.norm(rotation, axis=0))
         said = f"its axes are {sizes} long, and those of a rotation are 1 and at right angles"
         raise _wrong(whose, field, "no rotation", said)
-    if turned < 0:
+    if np.linalg.det(rotation) < 0:
         raise _wrong(whose, field, "mirrored", "its determinant is -1, and a rotation's is 1")
 
 
