@@ -279,10 +279,11 @@ def test_a_damaged_database_is_said_to_be(tmp_path: Path, statement: str, words:
 
 def test_a_schema_that_is_no_text_is_said_to_be_damaged(tmp_path: Path) -> None:
     path = _database(tmp_path / "database.db")
-    data = bytearray(path.read_bytes())
-    at = data.index(b"CREATE TABLE keypoints")
-    data[at + 13 : at + 16] = b"\xff\xfe\xfd"
-    path.write_bytes(data)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"CREATE TABLE keypoints", b"CREATE TABLE \xff\xfe\xfdpoints"))
+    path.write_bytes(
+        path.read_bytes().replace(b"CREATE TABLE images", b"CREATE \xff\xfeBLE images")
+    )
     with pytest.raises(sqlite3.Error):
         read_evidence(path)
 
