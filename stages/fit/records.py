@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,12 @@ import numpy as np
 
 from pipeline.artifacts.views import write_png
 from stages.fit.arrays import Arrays, Floats
+
+#: What numpy and zipfile raise for a file of which any byte may be wrong.
+_UNREADABLE = (
+    OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError,
+    MemoryError, OverflowError, SyntaxError, struct.error, zlib.error,
+)  # fmt: skip
 
 COLUMNS = ("iteration", "loss", "psnr", "gaussians")
 
@@ -53,6 +61,6 @@ def load_checkpoint(path: Path) -> tuple[Arrays, dict[str, Any]] | None:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         facts = json.loads(arrays.pop("_facts").tobytes().decode())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except _UNREADABLE:
         return None
     return arrays, facts

@@ -14,6 +14,8 @@ def run_report(workspace: str | Path) -> Path:
     Raises:
         RequestError: the folder is not a workspace, or can't be written to.
     """
+    from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.report.run import write_run_report
 
-    return write_run_report(Path(workspace))
+    with kept_for(share_for(Path(workspace))):
+        return write_run_report(Path(workspace))
