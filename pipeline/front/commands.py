@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError, ReconstructionError, StageError
+from pipeline.front.pages import write_pages
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.runner import Reporter, Runner, RunSummary
 from pipeline.stage import get_stage, stage_names
@@ -66,35 +67,14 @@ def _run(
     try:
         summary = runner.run(force=force)
     except (ReconstructionError, StageError) as error:
-        report, check = _write_pages(workspace, config, reporter)
+        report, check = write_pages(workspace, config, reporter)
         if report is not None:
             reporter.message(f"What came of it so far: {report}")
         if check and isinstance(error, ReconstructionError) and error.artifacts:
             error.args = (f"{error} To put it right, open {check} in a browser.",)
         raise
-    summary.report, summary.check = _write_pages(workspace, config, reporter)
+    summary.report, summary.check = write_pages(workspace, config, reporter)
     return summary
-
-
-def _write_pages(
-    workspace: Path, config: Config, reporter: Reporter
-) -> tuple[Path | None, Path | None]:
-    """Write the report, and the page to put the teeth right where there are any.
-
-    Whatever goes wrong with it is said, and harms nothing else.
-    """
-    if not config.run.report:
-        return None, None
-    from pipeline.pages.page import CHECK
-    from pipeline.studies.report import run_report
-
-    try:
-        report = run_report(workspace)
-    except Exception as error:
-        reporter.message(f"The report could not be written: {error}")
-        return None, None
-    check = workspace / CHECK
-    return report, check if check.is_file() else None
 
 
 def stages() -> list[dict[str, Any]]:
