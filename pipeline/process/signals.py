@@ -45,6 +45,10 @@ def install() -> None:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _obey)
     sys.unraisablehook = _unraisable
+    heard, hear = os.pipe()
+    os.set_blocking(hear, False)
+    signal.set_wakeup_fd(hear, warn_on_full_buffer=False)
+    _thread.start_new_thread(_end_if_stuck, (heard,))
 
 
 def asked() -> bool:
@@ -67,13 +71,15 @@ def _obey(number: int, frame: Any) -> None:
     now = time.monotonic()
     if _asked_at is None:
         _asked_at = now
-        _thread.start_new_thread(_end_if_stuck, ())  # takes no lock, unlike threading's
         raise KeyboardInterrupt
     if now - _asked_at > PATIENCE:
         end()
 
 
-def _end_if_stuck() -> None:
+def _end_if_stuck(heard: int) -> None:
+    """In a thread of its own: `_obey` has to wait until native code gives the main thread back."""
+    while not set(os.read(heard, 1)) & set(ENDING):
+        pass
     time.sleep(LAST_RESORT)
     end()
 

@@ -14,6 +14,7 @@ import contextlib
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,22 @@ SETTLED_NS = 2 * 10**9
 #: size, mtime_ns, ctime_ns, inode
 Mark = tuple[int, int, int, int]
 Marks = dict[str, Mark]
+
+
+@dataclass
+class Known:
+    """What is known of the files of a result.
+
+    Attributes:
+        outputs: what their manifest says of them, as one text.
+        settled: marks of files whose bytes were read and found right, long enough after they
+            changed last. These can be remembered.
+        read_now: marks of the others, and of files that this process has written.
+    """
+
+    outputs: str
+    settled: Marks = field(default_factory=dict)
+    read_now: Mapping[str, Mark | None] = field(default_factory=dict)
 
 
 class Memory(Record):
@@ -56,13 +73,13 @@ def mark_of(path: Path) -> Mark | None:
 
 
 def damaged(
-    folder: Path, manifest: Mapping[str, Any], known: Marks, kinds: Iterable[str] | None = None
+    folder: Path, manifest: Mapping[str, Any], known: Known, kinds: Iterable[str] | None = None
 ) -> list[str]:
     """Names of the files of a result that are not what its manifest says.
 
     Args:
         folder: of the result.
-        known: marks of files whose bytes were found right; those found right here are added.
+        known: of these files; what is found right here is added.
         kinds: look at these only.
     """
     wanted = None if kinds is None else set(kinds)
@@ -73,11 +90,14 @@ def damaged(
         mark = mark_of(folder / name)
         if mark is None or mark[0] != entry["size"]:
             wrong.append(name)
-        elif known.get(name) != mark:
-            if _digest(folder / name) == entry["sha256"]:
-                known[name] = mark
-            else:
+        elif mark not in (known.settled.get(name), known.read_now.get(name)):
+            latest = time.time_ns() - SETTLED_NS
+            if _digest(folder / name) != entry["sha256"]:
                 wrong.append(name)
+            elif max(mark[1:3]) < latest:
+                known.settled[name] = mark
+            else:
+                known.read_now = {**known.read_now, name: mark}
     return wrong
 
 
@@ -104,10 +124,9 @@ def remembered(folder: Path, manifest: Mapping[str, Any]) -> Marks:
 
 
 def remember(folder: Path, manifest: Mapping[str, Any], marks: Marks) -> None:
-    """Keep the marks of settled files beside a result; where that fails, all is read again."""
-    latest = time.time_ns() - SETTLED_NS
-    settled = {name: list(mark) for name, mark in marks.items() if max(mark[1:3]) < latest}
-    value = {"contents": _contents(manifest), "files": settled}
+    """Keep marks beside a result; where that fails, all is read again."""
+    files = {name: list(mark) for name, mark in marks.items()}
+    value = {"contents": _contents(manifest), "files": files}
     with contextlib.suppress(OSError):
         write_sealed(folder / MEMORY, value)
 

@@ -39,6 +39,7 @@ from pipeline.files import (
 )
 from pipeline.process.privacy import share_for
 from pipeline.store import checks
+from pipeline.store.checks import mark_of
 from pipeline.store.cleaning import PARTIAL, checkpoints, clean, holds_checkpoint
 from pipeline.store.faults import is_full, reason_of
 from pipeline.store.locks import locked
@@ -108,7 +109,7 @@ class Store:
     def __init__(self, root: Path, *, verify: bool = False) -> None:
         self.root = root
         self._verify = verify
-        self._marks: dict[Path, tuple[str, checks.Marks]] = {}
+        self._marks: dict[Path, checks.Known] = {}
         self._told: set[str] = set()
 
     def create(self, stages: Iterable[str] = (), more: Iterable[str] = ()) -> None:
@@ -169,21 +170,40 @@ class Store:
         self, folder: Path, manifest: dict[str, Any], kinds: Iterable[str] | None = None
     ) -> list[str]:
         """Names of the files of a result that are not what its manifest says."""
-        seal = canonical_json(manifest["outputs"])
+        outputs = canonical_json(manifest["outputs"])
         known = self._marks.get(folder)
-        if known is None or known[0] != seal:
+        if known is None or known.outputs != outputs:
             marks = {} if self._verify else checks.remembered(folder, manifest)
-            known = self._marks[folder] = seal, marks
-        before = dict(known[1])
-        wrong = checks.damaged(folder, manifest, known[1], kinds)
-        if known[1] != before and not wrong:
-            checks.remember(folder, manifest, known[1])
+            known = self._marks[folder] = checks.Known(outputs, marks)
+        before = dict(known.settled)
+        wrong = checks.damaged(folder, manifest, known, kinds)
+        if known.settled != before and not wrong:
+            checks.remember(folder, manifest, known.settled)
         return wrong
 
     def current(self, stage: str) -> Result | None:
         """Return the result in use, or None."""
         pointer = self.pointer(stage)
         return self.find(stage, pointer["key"]) if pointer else None
+
+    def in_use(self, stage: str) -> Result | None:
+        """As `current`, for who takes the result as it is.
+
+        Raises:
+            RequestError: it can't be told which result that is.
+        """
+        result = self.current(stage)
+        if result is None:
+            try:
+                read_record(self.root / stage / POINTER, Pointer)
+            except DamagedError as error:
+                raise RequestError(
+                    f"Which result of '{stage}' is in use is not known any more: "
+                    f"{self.root / stage / POINTER} is damaged ({error}). Run the command without "
+                    "--stages and --from and with the photographs named: every result that is "
+                    "there is used again."
+                ) from error
+        return result
 
     def pointer(self, stage: str) -> dict[str, Any] | None:
         """What `current.json` says: the key in use and why it came to be.
@@ -269,6 +289,7 @@ class Store:
         """Make what was written into `begin`'s folder the result of a key, all or nothing."""
         partial = self._partial(stage, key)
         remove(partial / "scratch")
+        marks = {name: mark_of(partial / name) for name in _names(partial, kinds)}
         outputs = {}
         for kind in kinds:
             listing = folder_listing(partial / kind)
@@ -288,7 +309,7 @@ class Store:
         partial.rename(final)
         fsync_folder(final.parent)
         remove(displaced)
-        self._marks.pop(final, None)
+        self._marks[final] = checks.Known(canonical_json(outputs), read_now=marks)
         return Result(stage, key, final, manifest)
 
     def discard_outputs(self, stage: str, key: str) -> None:
@@ -439,6 +460,12 @@ class Store:
     def checkpoints(self) -> dict[str, int]:
         """Name (``stage/folder``) -> bytes of what stopped runs left to go on from."""
         return checkpoints(self.root)
+
+
+def _names(folder: Path, kinds: Iterable[str]) -> Iterator[str]:
+    for kind in kinds:
+        for path in (folder / kind).rglob("*"):
+            yield path.relative_to(folder).as_posix()
 
 
 def partial_name(key: str) -> str:
