@@ -116,7 +116,10 @@ def make_request(
 
 
 def _still_there(path: str) -> bool:
-    return any(c in path for c in "*?[") or Path(path).exists()
+    try:
+        return any(c in path for c in "*?[") or Path(path).exists()
+    except OSError:  # too long a name, a folder of somebody else's
+        return False
 
 
 def _yaml_value(value: Any) -> str:

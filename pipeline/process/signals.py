@@ -97,10 +97,19 @@ def _unraisable(told: Any) -> None:
     if not (isinstance(told.exc_value, KeyboardInterrupt) and asked()):
         sys.__unraisablehook__(told)
         return
-    ours = [number for number in ENDING if signal.getsignal(number) is _obey]
-    if ours:
-        _asked_at = None
-        _thread.interrupt_main(ours[0])
+    _asked_at = None
+    _thread.start_new_thread(_ask_again, ())
+
+
+def _ask_again() -> None:
+    """From another thread, and a little later: the interrupt must not hit the same spot."""
+    time.sleep(0.05)
+    for number in ENDING:
+        if signal.getsignal(number) is _obey:
+            main = threading.main_thread().ident
+            if main is not None:
+                signal.pthread_kill(main, number)  # wakes it up as well, if it waits
+            return
 
 
 def run(command: Callable[[], int]) -> NoReturn:

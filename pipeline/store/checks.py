@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.files import sha256_file
+from pipeline.store.places import is_folder, remove
 from pipeline.store.records import DamagedError, Record, read_record, write_sealed
 
 MEMORY = "checked.json"
@@ -128,6 +129,8 @@ def remember(folder: Path, manifest: Mapping[str, Any], marks: Marks) -> None:
     files = {name: list(mark) for name, mark in marks.items()}
     value = {"contents": _contents(manifest), "files": files}
     with contextlib.suppress(OSError):
+        if is_folder(folder / MEMORY):
+            remove(folder / MEMORY)
         write_sealed(folder / MEMORY, value)
 
 

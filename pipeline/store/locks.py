@@ -13,6 +13,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from pipeline.files import write_atomic
+from pipeline.process.privacy import share_for
 from pipeline.store.places import free_for_file, is_folder, set_aside
 from pipeline.store.records import DamagedError, Owner, read_record
 
@@ -21,7 +22,8 @@ LOCK, OWNER = ".lock", ".owner.json"
 
 def lock_of(folder: Path) -> FileLock:
     """The lock of a folder, not acquired yet; what else is under its name is set aside."""
-    return FileLock(free_for_file(folder / LOCK), mode=0o600)
+    mode = 0o640 if share_for(folder) == "group" else 0o600  # filelock heeds no mask
+    return FileLock(free_for_file(folder / LOCK), mode=mode)
 
 
 @contextmanager

@@ -145,6 +145,8 @@ def read_sealed(path: Path) -> tuple[dict[str, Any], bool] | None:
         value = json.loads(text)
     except UnusableFile as error:
         raise DamagedError(f"it {error}") from error
+    except OSError as error:
+        raise DamagedError(f"it can't be read ({error.strerror or error})") from error
     except (ValueError, RecursionError) as error:
         raise DamagedError("it is no JSON") from error
     if not isinstance(value, dict):
