@@ -101,6 +101,9 @@ class Result:
 class Store:
     """The results in one workspace folder.
 
+    Attributes:
+        said: what was found damaged, and what was done about it.
+
     Args:
         root: the workspace.
         verify: read every byte of every result that is looked at, once, whatever is remembered.
@@ -110,7 +113,7 @@ class Store:
         self.root = root
         self._verify = verify
         self._marks: dict[Path, checks.Known] = {}
-        self._told: set[str] = set()
+        self.said: list[str] = []
 
     def create(self, stages: Iterable[str] = (), more: Iterable[str] = ()) -> None:
         """Make the workspace folder, and clear half-written files of killed runs out of it.
@@ -255,8 +258,8 @@ class Store:
         self._say(f"{said} It was moved to {target.name} and will be computed again.")
 
     def _say(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
+        if text not in self.said:
+            self.said.append(text)
             print(text, file=sys.stderr)
 
     # -- loading ---------------------------------------------------------------------------------

@@ -105,16 +105,18 @@ def run_on_views(
     message(f"COLMAP ({folder.name.removeprefix('colmap_')}) on {len(views)} views")
     record = {"key": key, **run_job(fresh, job)}
     _rename(fresh / "sparse", photo_names(views))
-    write_sealed(fresh / "run.json", {**record, "made": _made(fresh)})
+    record["made"] = _made(fresh)
+    write_sealed(fresh / "run.json", record)
     remove(folder)
     fresh.rename(folder)
     return record
 
 
 def _made(folder: Path) -> str:
-    """Hash of all files but the one that says it."""
+    """Hash of all files but the one that says it, and those that reading a database makes."""
+    passing = ("run.json", "database.db-wal", "database.db-shm")
     listing = folder_listing(folder)
-    return content_hash({name: entry for name, entry in listing.items() if name != "run.json"})
+    return content_hash({name: entry for name, entry in listing.items() if name not in passing})
 
 
 def photo_names(views: Sequence[View]) -> dict[str, str]:

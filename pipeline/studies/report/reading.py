@@ -20,6 +20,9 @@ def read_case(workspace: Path) -> Case:
     request = read_request(workspace)
     notes: list[str] = []
     store = Store(workspace)
+    for pointer in sorted(workspace.glob("*/current.json")):
+        store.current(pointer.parent.name)
+    notes += store.said
     try:
         config: Config | None = load_config(request.get("preset"), request.get("overrides", []))
     except PipelineError as error:
