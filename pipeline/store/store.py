@@ -316,9 +316,11 @@ class Store:
         return Result(stage, key, final, manifest)
 
     def discard_outputs(self, stage: str, key: str) -> None:
-        """Free the space of a failed try, but keep its scratch folder."""
-        if self._partial(stage, key).exists():
+        """Free the space of a failed try, but keep what it could go on from."""
+        if self.has_checkpoint(stage, key):
             self.begin(stage, key)
+        else:
+            remove(self._partial(stage, key))
 
     def has_checkpoint(self, stage: str, key: str) -> bool:
         """Did a killed run of this key leave something to go on from?"""

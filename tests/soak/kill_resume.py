@@ -41,14 +41,15 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 STARTED = 1.5
 MARK = "DENTALSPLAT_SOAK"
 SUITE = """\
-title: soak
+title: Soak
 data: {data}
 scenes:
-  - {{name: photos, images: three_photos}}
+  - {{name: three_photos, images: three_photos}}
 methods:
-  - {{name: ours, preset: dentalsplat}}
+  - {{name: dentalsplat, title: Ours}}
+  - {{name: 3dgs, preset: 3dgs, title: 3DGS}}
 tables:
-  - {{name: all, split: all}}
+  - {{name: photos, form: photos, title: Photographs, scenes: [three_photos]}}
 """
 
 
@@ -129,7 +130,8 @@ class Soak:
         self.complete(case, folder)
         case.seconds = time.monotonic() - begin
         case.whole = contents(folder)
-        print(f"{case.name}: {case.seconds:.1f} s undisturbed, {len(case.whole)} artifacts")
+        told = f"{case.seconds:.1f} s undisturbed, {len(case.whole)} artifacts"
+        print(f"{case.name}: {told}", flush=True)
 
     def kills(self, case: Case, count: int) -> None:
         """So many kills; whenever the command comes to its end, it begins anew."""
@@ -145,6 +147,7 @@ class Soak:
                 print(f"  {case.name}: done before {moment:.1f} s", flush=True)
                 if process.returncode != 0:
                     self.wrong(f"{case.name} ended with {process.returncode}: {told[-500:]}")
+                    return
                 self.check_end(case, folder)
                 shutil.rmtree(folder)
                 case.prepare(folder)
@@ -160,7 +163,7 @@ class Soak:
                 )  # fmt: skip
                 self.check_kill(case, number, moment, process.returncode, told)
         self.complete(case, folder)
-        shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)
 
     def check_kill(
         self, case: Case, number: signal.Signals, moment: float, status: int, told: str
@@ -189,7 +192,9 @@ class Soak:
                 folder = disk / "w"
                 process = self.start(case.command(folder))
                 _, told = process.communicate()
-                print(f"  {case.name}: {size / 1e6:.2f} MB: status {process.returncode}")
+                print(
+                    f"  {case.name}: {size / 1e6:.2f} MB: status {process.returncode}", flush=True
+                )
                 if process.returncode not in (0, 2) or "Traceback" in told:
                     self.wrong(f"full disk gave {process.returncode}: {told[-500:]}")
                 elif process.returncode == 2 and "full" not in told:
@@ -211,8 +216,8 @@ class Soak:
             if process.returncode != 0:
                 self.wrong(f"two {case.name} at once: {process.returncode}: {told[-500:]}")
         self.check_end(case, folder)
-        print(f"  two {case.name} at once: done")
-        shutil.rmtree(folder)
+        print(f"  two {case.name} at once: done", flush=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -62,8 +62,8 @@ class Job:
             EXIF), for those images where it is.
         masked: there are masks in ``masks/``.
         seed: of COLMAP's random samples.
-        threads: for features and matching; verification and mapping take one, so that the result
-            doesn't depend on them.
+        threads: for matching; features (which are stored in the order in which they are found),
+            verification and mapping take one, so that the result doesn't depend on them.
     """
 
     options: Options = field(default_factory=dict)
@@ -209,7 +209,7 @@ def reconstruct(folder: Path, job: Job) -> None:
 
     database = folder / "database.db"
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = job.threads
+    extraction.num_threads = 1
     reader = pycolmap.ImageReaderOptions()
     if job.masked:
         reader.mask_path = str(folder / "masks")
