@@ -19,6 +19,8 @@ def run_report(workspace: str | Path, *, anonymous: bool = False) -> Path:
     Raises:
         RequestError: the folder is not a workspace, or can't be written to.
     """
+    from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.report.run import write_run_report
 
-    return write_run_report(Path(workspace), anonymous)
+    with kept_for(share_for(Path(workspace))):
+        return write_run_report(Path(workspace), anonymous)
