@@ -6,7 +6,6 @@ own they share the time.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import to_uint8
 from pipeline.errors import StageError
+from pipeline.installed import module_command
 from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,
@@ -222,11 +222,9 @@ class MeshProcess:
         self._log = folder / "mesh_log.txt"
         self._mesh.unlink(missing_ok=True)
         task.save(self._task)
-        home = str(Path(__file__).resolve().parents[3])
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", __name__, str(self._task), str(self._mesh)],
-                env={**os.environ, "PYTHONPATH": os.pathsep.join([home, *filter(None, sys.path)])},
+                [*module_command(__name__), str(self._task), str(self._mesh)],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
 
