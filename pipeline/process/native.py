@@ -18,13 +18,35 @@ from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
+from pipeline.process.signals import ENDING
+
 
 def _log_to_stderr(pycolmap: Any) -> None:
     pycolmap.logging.logtostderr = True
 
 
-#: Library -> what is done with it as soon as it is there.
-MEDDLERS: dict[str, Callable[[Any], None]] = {"pycolmap": _log_to_stderr}
+def _nothing(library: Any) -> None:
+    pass
+
+
+#: Library -> what is done with it as soon as it is there. Those with nothing start threads, which
+#: are not to hear of signals: the system gives one to any thread that does.
+MEDDLERS: dict[str, Callable[[Any], None]] = {
+    "pycolmap": _log_to_stderr, "numpy": _nothing, "scipy.linalg": _nothing,
+}  # fmt: skip
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Signals to end that come meanwhile are heard afterwards; threads started inside hear none."""
+    if os.name != "posix":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -62,7 +84,7 @@ class _Watched(Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         os.environ.setdefault("GLOG_logtostderr", "1")  # read when the library is loaded
-        with handlers_kept():
+        with signals_held(), handlers_kept():
             self._inner.exec_module(module)
         MEDDLERS[self._name](module)
 

@@ -78,6 +78,8 @@ def _obey(number: int, frame: Any) -> None:
 
 def _end_if_stuck(heard: int) -> None:
     """In a thread of its own: `_obey` has to wait until native code gives the main thread back."""
+    if os.name == "posix":  # no handler of a library is ever to run here
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     while not set(os.read(heard, 1)) & set(ENDING):
         pass
     time.sleep(LAST_RESORT)

@@ -133,6 +133,7 @@ def test_many_signals_are_one() -> None:
     """Also while what the first one interrupted is being put in order."""
     body = """
 try:
+    print('inside', flush=True)
     time.sleep(20)
 finally:
     print('cleaning', flush=True)
@@ -141,6 +142,7 @@ finally:
 """
     with started(script(body), ROOT) as process:
         wait_for(process)
+        wait_for(process, "inside")
         for count in range(20):
             process.send_signal(signals.ENDING[count % len(signals.ENDING)])
             time.sleep(0.02)
