@@ -7,8 +7,8 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 
 class UnusableFile(Exception):  # noqa: N818
@@ -53,7 +53,7 @@ _SORTS = (
 
 
 @contextmanager
-def opened(path: Path, kind: Kind) -> Iterator[BinaryIO]:
+def opened(path: Path, kind: Kind) -> Iterator[BufferedReader]:
     """A file of the user's to read from; what its name leads to through links counts.
 
     Args:

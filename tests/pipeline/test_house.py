@@ -167,7 +167,17 @@ def test_libraries_know_no_stage() -> None:
 
 
 def test_stages_know_only_the_ground_they_stand_on() -> None:
-    ground = {"artifacts", "errors", "files", "geometry", "installed", "kernels", "pages", "stage"}
+    ground = {
+        "artifacts",
+        "errors",
+        "files",
+        "geometry",
+        "installed",
+        "kernels",
+        "pages",
+        "stage",
+        "untrusted",
+    }
     found = [
         f"{name} -> {other}"
         for name in modules()
