@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from pipeline.errors import PipelineError, RequestError
+from pipeline.untrusted.names import let_streams_show_all
 
 EXAMPLES = """\
 dentalsplat turns a few photographs of teeth into a 3D scene that you can turn around and look at.
@@ -355,6 +356,7 @@ def _only_workspace() -> Path:
 
 def main() -> NoReturn:
     """Run the command line; every outcome has its exit status (docs/architecture.md)."""
+    let_streams_show_all()
     signal.signal(signal.SIGTERM, _interrupt)
     debug = "--debug" in sys.argv
     try:

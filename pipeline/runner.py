@@ -25,6 +25,7 @@ from pipeline.planning import (
 )
 from pipeline.stage import StageContext, get_stage, usable_stages
 from pipeline.store import CorruptResultError, Result, Store, is_disk_full
+from pipeline.untrusted.names import shown
 from pipeline.workspace import Request
 
 Figure = float | int | str
@@ -143,6 +144,7 @@ class RunContext(StageContext):
         self._reporter.progress(self._planned.name, step, done, total, **figures)
 
     def warn(self, message: str) -> None:
+        message = shown(message)
         self.warnings.append(message)
         self._reporter.message(f"{self._planned.name}: {message}")
 

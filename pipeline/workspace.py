@@ -13,6 +13,7 @@ from pipeline.errors import RequestError
 from pipeline.files import read_json, write_json
 from pipeline.planning import plan_chain, resolve_chain
 from pipeline.store import Store
+from pipeline.untrusted.names import printable
 
 #: Folders that say nothing about the case inside them; their parent's name does.
 GENERIC_FOLDERS = {"images", "image", "frames", "photos", "photographs", "input", "inputs", "rgb"}
@@ -99,11 +100,11 @@ def default_workspace(images: Sequence[str | Path]) -> Path:
     if single and first.is_dir():
         folder = first.resolve()
     elif single and not any(c in first.name for c in "*?["):
-        return Path("runs") / first.stem
+        return Path("runs") / printable(first.stem)
     else:
         folder = first.resolve().parent
     name = folder.parent.name if folder.name.lower() in GENERIC_FOLDERS else folder.name
-    return Path("runs") / (name or "case")
+    return Path("runs") / (printable(name) or "case")
 
 
 @dataclass

@@ -42,6 +42,8 @@ CAMERA_LIST = Kind("a list of cameras", 1 << 26)
 ARRAYS = Kind("arrays", 1 << 31)
 #: Settings, suites, labels of teeth: read by a parser that takes its time.
 SETTINGS = Kind("a text of settings", 1 << 20)
+#: What is only hashed.
+ANY = Kind("a file", 1 << 44)
 
 _SORTS = (
     (stat.S_ISDIR, "a folder"),
@@ -50,6 +52,13 @@ _SORTS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+def sort_of(mode: int) -> str | None:
+    """What stands under a name that is no regular file, from its mode; None for a file."""
+    if stat.S_ISREG(mode):
+        return None
+    return next((name for is_sort, name in _SORTS if is_sort(mode)), "no file")
 
 
 @contextmanager
@@ -72,8 +81,7 @@ def opened(path: Path, kind: Kind) -> Iterator[BufferedReader]:
         raise UnusableFile(f"can't be read ({reason})") from error
     with os.fdopen(descriptor, "rb") as file:
         found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            sort = next((name for is_sort, name in _SORTS if is_sort(found.st_mode)), "no file")
+        if (sort := sort_of(found.st_mode)) is not None:
             raise UnusableFile(f"is {sort}, not a file")
         if found.st_size > kind.most_bytes:
             raise UnusableFile(

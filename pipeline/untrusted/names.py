@@ -8,7 +8,10 @@ whatever opens a file takes the name itself.
 
 from __future__ import annotations
 
+import codecs
+import io
 import os
+import sys
 import unicodedata
 
 #: Control codes, surrogates, and marks that turn the direction of the text around them.
@@ -27,10 +30,36 @@ def printable(name: str | os.PathLike[str]) -> str:
     return "".join(_shown(character) for character in text)
 
 
+def shown(text: str) -> str:
+    """A text that may hold names: as `printable`, with its line ends."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def storable(text: str) -> str:
     """A text with its surrogates written as JSON does (``\\udcff``): a reader of JSON gets them
     back, and every other file can hold it."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def let_streams_show_all() -> None:
+    """Make standard output and error take any text: what their encoding lacks is written out.
+
+    Where a locale is no UTF-8, or a name is none, printing would end a run that went well.
+    """
+    codecs.register_error("written_out", _write_out)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="written_out")
+
+
+def _write_out(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lost = error.object[error.start : error.end]
+    return "".join(
+        _shown(c) if 0xDC80 <= ord(c) <= 0xDCFF else c.encode("ascii", "backslashreplace").decode()
+        for c in lost
+    ), error.end
 
 
 def _shown(character: str) -> str:

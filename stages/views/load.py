@@ -14,7 +14,6 @@ import numpy as np
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, read
-from pipeline.untrusted.names import printable
 from stages.views.reading.apart import Decoder
 from stages.views.reading.video import VideoFrame, map_frames
 from stages.views.working import Mask, Prepared, check_size, prepare
@@ -171,7 +170,7 @@ def _read_mask(path: Path, decoder: Decoder) -> Mask:
     try:
         return decoder.mask(read(path, PHOTOGRAPH))
     except UnusableFile as error:
-        raise UnusableFile(f"has a mask ({printable(path.name)}) that {error}") from error
+        raise UnusableFile(f"has a mask ({path.name}) that {error}") from error
 
 
 def _refuse(problems: Sequence[str], total: int) -> None:
