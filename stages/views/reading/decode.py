@@ -26,7 +26,7 @@ Valid = npt.NDArray[np.bool_]
 #: Above this, one at a time whatever the number of threads.
 LARGE = 60_000_000
 #: Pixels that are brought to sRGB at a time: what that takes is small beside the picture.
-STRIP = 1 << 22
+STRIP = 1 << 20
 #: What Pillow and its plugins raise on damaged files.
 DAMAGED = (
     OSError, SyntaxError, ValueError, RuntimeError, EOFError, LookupError, TypeError,
