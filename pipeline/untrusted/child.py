@@ -8,6 +8,7 @@ the run that file. What comes back are JSON values and arrays of numbers: nothin
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
 import json
 import math
@@ -46,7 +47,7 @@ _TYPES = {"|u1": np.uint8, "|b1": np.bool_, "<f4": np.float32}
 
 def seconds_for(size: int) -> float:
     """How long a file may be worked on, from its bytes: ten times what slow machines need."""
-    return 300.0 + size / 500_000
+    return 600.0 + size / 250_000
 
 
 class Child:
@@ -68,11 +69,14 @@ class Child:
         }  # fmt: skip
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "pipeline.untrusted.child", work, str(memory)],
-            env=environment, pass_fds=tuple(files), bufsize=0, pipesize=1 << 20,
+            env=environment, pass_fds=tuple(files), bufsize=0,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         assert self._process.stdin is not None and self._process.stdout is not None
         self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
+        with contextlib.suppress(OSError, AttributeError):  # other systems; or a user's share is up
+            for end in (self._to, self._from):
+                fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, 1 << 20)
         os.set_blocking(self._to, False)
         os.set_blocking(self._from, False)
         #: Is it waiting for a request?

@@ -263,7 +263,7 @@ def _png(data: bytes) -> Header:
     width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 4)
     # OpenCV decodes 16 bits into one buffer and copies it to another.
-    return Header("PNG", width, height, bits, 1.0 + 4 * channels if bits == 16 else 9.0)
+    return Header("PNG", width, height, bits, max(7.0, 1.0 + 4 * channels) if bits == 16 else 9.0)
 
 
 def _bmp(data: bytes) -> Header:

@@ -12,6 +12,7 @@ from pathlib import Path, PurePath
 from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.files import sort_of
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.pictures import KNOWN
 from stages.views.sampling import natural_key
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
@@ -19,7 +20,6 @@ VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
 )  # fmt: skip
 MASK_PREFIX = "masks/"
-KINDS_OF_IMAGE = "JPEG, PNG, TIFF, WebP, HEIC or BMP"
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _expand(item: str | Path) -> list[Path]:
     if not is_image(path) and not is_video(path):
         raise RequestError(
             f"The file {printable(path.name)} is neither a photograph nor a video by its name "
-            f"('{path.suffix or 'no suffix'}'). Photographs are {KINDS_OF_IMAGE}; videos are MP4, "
+            f"('{path.suffix or 'no suffix'}'). Photographs are {KNOWN}; videos are MP4, "
             "MOV, MKV, AVI or WebM. Convert it, or leave it out."
         )
     return [path]
@@ -228,7 +228,7 @@ def _expand_folder(folder: Path) -> list[Path]:
     if images:
         return images
     videos = [entry.path.name for entry in entries if is_video(entry.path)]
-    advice = f"Photographs are {KINDS_OF_IMAGE}."
+    advice = f"Photographs are {KNOWN}."
     if videos:
         advice = f"To use the video, name it: {folder / videos[0]}"
     else:
