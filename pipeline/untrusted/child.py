@@ -8,13 +8,11 @@ the run that file. What comes back are JSON values and arrays of numbers: nothin
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import importlib
 import json
 import math
 import os
 import queue
-import select
 import signal
 import struct
 import subprocess
@@ -29,6 +27,7 @@ from typing import Any, NoReturn, Self
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.measure import confine
 from pipeline.untrusted.files import UnusableFile
 
 Values = dict[str, Any]
@@ -73,12 +72,8 @@ class Child:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
-        with contextlib.suppress(OSError, AttributeError):  # other systems; or a user's share is up
-            for end in (self._to, self._from):
-                fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, 1 << 20)
-        os.set_blocking(self._to, False)
-        os.set_blocking(self._from, False)
+        self._to: Any = self._process.stdin
+        self._from: Any = self._process.stdout
         #: Is it waiting for a request?
         self.idle = True
 
@@ -98,12 +93,12 @@ class Child:
         """
         assert self.idle, "a request is being worked on"
         self.idle = False
-        clock = _Clock(seconds)
+        watch = _Watch(seconds, self.stop)
         try:
             for part in _parts(dict(values), arrays):
-                self._write(part, clock)
+                self._write(part)
             while True:
-                reply, found = self._receive(clock)
+                reply, found = self._receive(watch)
                 state = reply.pop("state")
                 if state == "more":
                     yield reply, found
@@ -114,15 +109,13 @@ class Child:
                 if state == "unusable":
                     raise UnusableFile(str(reply["text"]))
                 return
-        except _OutOfTimeError:
-            self.close()
-            raise UnusableFile(
-                "took too long to decode, as files do that are damaged or made to do harm"
-            ) from None
         except _DiedError:
             self.close()
-            raise UnusableFile(_why(self._process.returncode)) from None
+            late = "took too long to decode, as files do that are damaged or made to do harm"
+            why = late if watch.late else _why(self._process.returncode)
+            raise UnusableFile(why) from None
         finally:
+            watch.end()
             if not self.idle:
                 self.close()
 
@@ -150,36 +143,29 @@ class Child:
     ) -> None:  # fmt: skip
         self.close()
 
-    def _write(self, data: memoryview, clock: _Clock) -> None:
-        while data:
-            _wait(self._to, select.POLLOUT, clock)
-            try:
-                data = data[os.write(self._to, data[: 1 << 20]) :]
-            except BlockingIOError:
-                continue
-            except OSError as error:
-                self._mourn(error)
+    def _write(self, data: memoryview) -> None:
+        try:
+            while data:
+                data = data[self._to.write(data) :]
+        except OSError as error:
+            self._mourn(error)
 
-    def _read(self, view: memoryview, clock: _Clock) -> None:
+    def _read(self, view: memoryview, watch: _Watch) -> None:
         while view:
-            _wait(self._from, select.POLLIN, clock)
-            try:
-                count = os.readv(self._from, [view])
-            except BlockingIOError:
-                continue
-            if count == 0:
+            count = self._from.readinto(view[: 1 << 24])
+            if not count:
                 self._mourn(None)
-            clock.heard()
+            watch.heard()
             view = view[count:]
 
-    def _receive(self, clock: _Clock) -> Reply:
+    def _receive(self, watch: _Watch) -> Reply:
         length = bytearray(_LENGTH.size)
-        self._read(memoryview(length), clock)
+        self._read(memoryview(length), watch)
         (size,) = _LENGTH.unpack(length)
         if size > _MOST_JSON:
             raise _DiedError
         text = bytearray(size)
-        self._read(memoryview(text), clock)
+        self._read(memoryview(text), watch)
         try:
             values = json.loads(text)
             arrays = list(_empty(values.pop("arrays")))
@@ -187,7 +173,7 @@ class Child:
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise _DiedError from error  # what spoke there was not our code any more
         for array in arrays:
-            self._read(_bytes_of(array), clock)
+            self._read(_bytes_of(array), watch)
         return values, arrays
 
     def _mourn(self, error: OSError | None) -> NoReturn:
@@ -251,31 +237,39 @@ class _DiedError(Exception):
     pass
 
 
-class _OutOfTimeError(Exception):
-    pass
+class _Watch:
+    """Ends what takes too long, or says nothing for too long.
 
+    Args:
+        seconds: for all of it.
+        stop: called, by a thread, when they are over.
+    """
 
-class _Clock:
-    """When to stop waiting."""
-
-    def __init__(self, seconds: float) -> None:
-        self._end = time.monotonic() + seconds
+    def __init__(self, seconds: float, stop: Callable[[], None]) -> None:
+        self._last, self._stop = time.monotonic() + seconds, stop
+        self._done = threading.Event()
+        #: Was it stopped?
+        self.late = False
         self.heard()
+        threading.Thread(target=self._wait, daemon=True).start()
 
     def heard(self) -> None:
+        """It has said something."""
         self._silent_since = time.monotonic()
 
-    def left(self) -> float:
-        """Seconds left."""
-        return min(self._end, self._silent_since + SILENCE) - time.monotonic()
+    def end(self) -> None:
+        """It is done."""
+        self._done.set()
 
-
-def _wait(descriptor: int, event: int, clock: _Clock) -> None:
-    poll = select.poll()
-    poll.register(descriptor, event)
-    left = clock.left()
-    if left <= 0 or not poll.poll(left * 1000):
-        raise _OutOfTimeError
+    def _wait(self) -> None:
+        while True:
+            left = min(self._last, self._silent_since + SILENCE) - time.monotonic()
+            if left <= 0:
+                self.late = True
+                self._stop()
+                return
+            if self._done.wait(left):
+                return
 
 
 def _why(status: int | None) -> str:
@@ -317,7 +311,8 @@ def serve(work: Work, memory: int) -> None:
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints goes nowhere
     requests: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    _give_up_rights(memory)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    confine(memory)
     threading.Thread(target=_listen, args=(requests,), daemon=True).start()
     while True:
         values, arrays = requests.get()
@@ -363,24 +358,6 @@ def _listen(requests: queue.SimpleQueue[Reply]) -> None:
             fill(_bytes_of(array))
             arrays.append(array)
         requests.put((values, arrays))
-
-
-def _give_up_rights(memory: int) -> None:
-    """No more files, no files of core, so much memory; the first to go where memory runs out."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("1000")
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    with contextlib.suppress(OSError, ValueError):
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + memory
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    for right in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE):
-        with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(right, (0, 0))
 
 
 def main(work: str, memory: str) -> None:

@@ -81,6 +81,8 @@ def map_frames(
         for reply, arrays in child.ask(request, [], limit):
             if "size" in reply:
                 check_size(*reply["size"])
+            elif "counted" in reply:
+                continue
             elif "again" in reply:
                 made.clear()
             elif "done" in reply:

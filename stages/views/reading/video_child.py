@@ -31,7 +31,7 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
     """
     with os.fdopen(int(values["file"]), "rb") as file:
         try:
-            count = _count_packets(file)
+            count = yield from _count_packets(file)
             if count == 0:
                 raise UnusableFile("has no video frames in it")
             wanted, threads = int(values["wanted"]), int(values["threads"])
@@ -46,12 +46,17 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
             raise UnusableFile(f"can't be read as a video ({reason})") from error
 
 
-def _count_packets(file: BinaryIO) -> int:
+def _count_packets(file: BinaryIO) -> Generator[Reply, None, int]:
+    """How many frames the film seems to have; says now and then that it is at work."""
+    count = 0
     with opened_film(file) as container:
         stream = _video(container)
         check_size(stream.codec_context.width, stream.codec_context.height)
-        packets = container.demux(stream)
-        return sum(1 for packet in packets if packet.size and not packet.is_discard)
+        for number, packet in enumerate(container.demux(stream)):
+            count += bool(packet.size and not packet.is_discard)
+            if number % 500 == 0:
+                yield {"counted": count}, []
+    return count
 
 
 def _video(container: Any) -> Any:
