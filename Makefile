@@ -7,7 +7,9 @@ STEPS ?= 9000
 RATE ?= 0.003
 BIN := .venv/bin
 
-.PHONY: demo test lint wheel-test docs bench reader system chromium clean
+SEED ?= 0
+COUNT ?= 20
+.PHONY: demo test lint wheel-test docs bench soak reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -30,6 +32,11 @@ docs: .venv/installed-dev
 
 bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+# What takes too long for the test suite: kills, full disks, and damaged files by the thousand.
+soak: .venv/installed-dev
+	for script in $$(grep -l 'def main' tests/soak/*.py); do \
+	    $(BIN)/python $$script --seed $(SEED) --count $(COUNT) || exit 1; done
 
 # The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: hours.
 # START=FILE goes on from weights that an earlier training wrote (4000 steps at RATE=0.002 then do).

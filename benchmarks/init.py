@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
@@ -29,6 +28,7 @@ from init_scores import Truth, read_truth, rotation_errors, score_points, transl
 
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.models.known_cameras import model_files, read_cameras
+from pipeline.measure import cpu_seconds
 from pipeline.stage import LocalContext, get_stage
 from pipeline.studies.compare.colmap_run import SETTINGS, Job, run_job
 from pipeline.studies.compare.models import model_folders
@@ -121,13 +121,11 @@ def run_colmap(files: tuple[Path, ...], method: str, threads: int) -> tuple[Plac
         (folder / "images").mkdir()
         for path in files:
             (folder / "images" / path.name).symlink_to(path.resolve())
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        before = cpu_seconds()
         done = run_job(folder, Job(SETTINGS[COLMAP_SETTINGS[method]], threads=threads))
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         if done["failure"]:
             raise RuntimeError(done["failure"])
-        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        return read_placed(folder / "sparse"), done["seconds"], cpu
+        return read_placed(folder / "sparse"), done["seconds"], cpu_seconds() - before
 
 
 def read_placed(folder: Path) -> Placed:

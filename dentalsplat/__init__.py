@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
     from pipeline.front.settings import Setting
+    from pipeline.process.privacy import Share
     from pipeline.runner import Reporter, RunSummary
     from pipeline.stage import Finding
     from pipeline.workspace import StageStatus
@@ -56,6 +57,8 @@ def run(
     from_stage: str | None = None,
     force: bool = False,
     dry_run: bool = False,
+    verify: bool = False,
+    share: Share | None = None,
     reporter: Reporter | None = None,
 ) -> RunSummary:
     """Make a scene of photographs; every stage's result is kept and used again while it is valid.
@@ -70,6 +73,9 @@ def run(
         from_stage: begin here, with what the workspace holds from before.
         force: compute the stages anew although a valid result exists.
         dry_run: only say what would be done.
+        verify: read every byte of the results, and not only of those that seem to have changed.
+        share: who else may read the workspace: ``nobody`` or the owner's ``group``; None: as its
+            folder is already. Until the run ends, all that this process writes is kept from others.
         reporter: hears of the progress.
 
     Returns:
@@ -81,7 +87,8 @@ def run(
     """
     return _engine().run(
         images, workspace=workspace, preset=preset, overrides=overrides, stages=stages,
-        from_stage=from_stage, force=force, dry_run=dry_run, reporter=reporter,
+        from_stage=from_stage, force=force, dry_run=dry_run, verify=verify, share=share,
+        reporter=reporter,
     )  # fmt: skip
 
 
@@ -92,17 +99,20 @@ def status(
     preset: str | Path | None = None,
     overrides: Settings = (),
     stages: Sequence[str] | None = None,
+    verify: bool = False,
 ) -> list[StageStatus]:
     """Tell each stage of a workspace: cached, stale (and why), missing or failed.
 
-    Given a preset, overrides or stages, it tells what a run with them would find.
+    Given a preset, overrides or stages, it tells what a run with them would find. `verify` reads
+    every byte of the results again.
 
     Raises:
         RequestError: there is no such workspace, or the request is wrong.
     """
     return _engine().status(
-        images, workspace=workspace, preset=preset, overrides=overrides, stages=stages
-    )
+        images, workspace=workspace, preset=preset, overrides=overrides, stages=stages,
+        verify=verify,
+    )  # fmt: skip
 
 
 def stages() -> list[dict[str, Any]]:
@@ -170,6 +180,7 @@ def benchmark(
     data: str | Path | None = None,
     jobs: int = 1,
     overrides: Settings = (),
+    share: Share | None = None,
     say: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Run scenes x methods x view counts, and write tables of them.
@@ -180,6 +191,7 @@ def benchmark(
         data: folder where the scenes' paths begin, instead of the one that the suite names.
         jobs: workspaces at a time; the cores are divided between them.
         overrides: settings for all cells.
+        share: who else may read the folder; see `run`.
         say: hears a line per cell.
 
     Returns:
@@ -188,11 +200,18 @@ def benchmark(
     Raises:
         RequestError: the suite is wrong, its data are missing, or `out` can't be used.
     """
-    return _engine().benchmark(suite, out=out, data=data, jobs=jobs, overrides=overrides, say=say)
+    return _engine().benchmark(
+        suite, out=out, data=data, jobs=jobs, overrides=overrides, share=share, say=say
+    )
 
 
-def clean(workspace: str | Path, *, keep: int = 0) -> tuple[list[str], int]:
+def clean(
+    workspace: str | Path, *, keep: int = 0, everything: bool = False
+) -> tuple[list[str], int]:
     """Delete the results that are not in use, but for the `keep` newest of each stage.
+
+    What a stopped run can go on from stays, unless it is of no use to the last request, or
+    `everything` is asked for.
 
     Returns:
         What was deleted (``stage/key``), and the bytes freed.
@@ -200,7 +219,7 @@ def clean(workspace: str | Path, *, keep: int = 0) -> tuple[list[str], int]:
     Raises:
         RequestError: there is no such workspace.
     """
-    return _engine().clean(workspace, keep=keep)
+    return _engine().clean(workspace, keep=keep, everything=everything)
 
 
 def doctor() -> list[Finding]:

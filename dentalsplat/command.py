@@ -12,9 +12,16 @@ def main() -> NoReturn:
     """Run the command line; where another package has the name of ours, say so (status 2)."""
     try:
         check_names()
+        from pipeline.process import signals
     except NameTakenError as error:
         print(f"\n{error}", file=sys.stderr)
         sys.exit(2)
-    from pipeline.cli import main as command_line
+    except KeyboardInterrupt:
+        sys.exit(130)
+    signals.run(_program)
 
-    command_line()
+
+def _program() -> int:
+    from pipeline.cli import program
+
+    return program()

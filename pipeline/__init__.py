@@ -12,6 +12,10 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from pipeline.process.native import watch_imports
+
+watch_imports()
+
 _HOMES = {
     "run": "pipeline.front.commands",
     "status": "pipeline.workspace",

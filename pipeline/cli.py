@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
-from pipeline.errors import PipelineError, RequestError
+from pipeline.errors import PipelineError, RequestError, nearest
+from pipeline.process import signals
+from pipeline.process.privacy import SHARES, Share, private_from_now_on
 from pipeline.untrusted.names import let_streams_show_all
 
 EXAMPLES = """\
@@ -65,6 +66,17 @@ Overrides = Annotated[
 Stages = Annotated[
     str | None, typer.Option("--stages", help="Only these, in this order: init,sap,fit.")
 ]
+Verify = Annotated[
+    bool,
+    typer.Option("--verify", help="Read every byte of the cached results again."),
+]
+Sharing = Annotated[
+    str | None,
+    typer.Option(
+        "--share", metavar="[nobody|group]", show_default=False,
+        help="Who else may read what is written.  [default: as the workspace is, first nobody]",
+    ),
+]  # fmt: skip
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -99,6 +111,8 @@ def run_command(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Compute anew what is cached.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would run.")] = False,
+    verify: Verify = False,
+    share: Sharing = None,
     as_json: AsJson = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the whole trace of an error.")
@@ -121,6 +135,8 @@ def run_command(
         from_stage=from_stage,
         force=force,
         dry_run=dry_run,
+        verify=verify,
+        share=_share(share),
         reporter=make_reporter(quiet=dry_run),
     )
     if as_json:
@@ -138,6 +154,7 @@ def status_command(
     config: Preset = None,
     stages: Stages = None,
     overrides: Overrides = None,
+    verify: Verify = False,
     as_json: AsJson = False,
 ) -> None:
     """Show each stage: cached, stale (and which field or input changed), missing or failed."""
@@ -150,6 +167,7 @@ def status_command(
         preset=config,
         overrides=overrides or [],
         stages=_names(stages),
+        verify=verify,
     )
     if as_json:
         print(json.dumps([dataclasses.asdict(entry) for entry in found], indent=1))
@@ -158,11 +176,20 @@ def status_command(
 
 
 @app.command("report")
-def report_command(workspace: Workspace = None) -> None:
+def report_command(
+    workspace: Workspace = None,
+    anonymous: Annotated[
+        bool,
+        typer.Option(
+            "--anonymous",
+            help="Write report_anonymous.html, without names and dates, to be passed on.",
+        ),
+    ] = False,
+) -> None:
     """Write WORKSPACE/report.html: what came out, how sure it is, and everything behind it."""
     from pipeline.studies.report import run_report
 
-    print(run_report(workspace or _only_workspace()))
+    print(run_report(workspace or _only_workspace(), anonymous=anonymous))
 
 
 @app.command("stages")
@@ -295,6 +322,7 @@ def benchmark_command(
         int, typer.Option("--jobs", min=1, help="Workspaces at a time; they share the cores.")
     ] = 1,
     overrides: Overrides = None,
+    share: Sharing = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare methods on scenes and numbers of views, and write the paper's tables of them.
@@ -308,7 +336,7 @@ def benchmark_command(
 
     results = benchmark(
         suite, out=out, data=data, jobs=jobs, overrides=overrides or [],
-        say=lambda text: print(text, file=sys.stderr, flush=True),
+        share=_share(share), say=lambda text: print(text, file=sys.stderr, flush=True),
     )  # fmt: skip
     print(json.dumps(results, indent=1) if as_json else markdown(results), end="\n" * as_json)
     if results["problems"]:
@@ -323,15 +351,22 @@ def clean_command(
     keep: Annotated[
         int, typer.Option("--keep", min=0, help="Keep this many unused results of each stage.")
     ] = 0,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also delete what a stopped run would go on from.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Delete results that are not in use."""
-    from pipeline.workspace import clean
+    """Delete results that are not in use; what a stopped run can go on from is kept."""
+    from pipeline.workspace import checkpoints, clean
 
-    removed, freed = clean(workspace or _only_workspace(), keep=keep)
+    folder = workspace or _only_workspace()
+    removed, freed = clean(folder, keep=keep, everything=everything)
+    kept = checkpoints(folder)
     if as_json:
-        print(json.dumps({"removed": removed, "bytes": freed}, indent=1))
+        print(json.dumps({"removed": removed, "bytes": freed, "checkpoints": kept}, indent=1))
     else:
+        for name, size in kept.items():
+            print(f"kept {name}, {size / 2**20:.1f} MB: a run goes on from it (--all deletes it)")
         for name in removed:
             print(f"deleted {name}")
         print(f"{len(removed)} results deleted, {freed / 2**20:.1f} MB freed")
@@ -341,6 +376,15 @@ def _names(stages: str | None) -> list[str] | None:
     if stages is None:
         return None
     return [name.strip() for name in stages.split(",") if name.strip()]
+
+
+def _share(text: str | None) -> Share | None:
+    if text is None:
+        return None
+    for share in SHARES:
+        if text == share:
+            return share
+    raise RequestError(f"--share {text}: it may be {' or '.join(SHARES)}.{nearest(text, SHARES)}")
 
 
 def _only_workspace() -> Path:
@@ -354,31 +398,38 @@ def _only_workspace() -> Path:
     raise RequestError(f"Say which workspace: -w FOLDER{some}.")
 
 
+def program() -> int:
+    """The program itself: what it writes, photographs of patients, is its user's alone."""
+    private_from_now_on()
+    return command_line()
+
+
 def main() -> NoReturn:
+    """Run the command line in this process and exit; its signals and file mask stay as they are."""
+    status = command_line()
+    if status == signals.STATUS:
+        print(signals.TEXT, file=sys.stderr)
+    sys.exit(status)
+
+
+def command_line() -> int:
     """Run the command line; every outcome has its exit status (docs/architecture.md)."""
     let_streams_show_all()
-    signal.signal(signal.SIGTERM, _interrupt)
     debug = "--debug" in sys.argv
     try:
         status = app(standalone_mode=False)
     except PipelineError as error:
-        status = _fail(error, error.exit_status, debug)
+        status = signals.STATUS if signals.asked() else _fail(error, error.exit_status, debug)
     except (KeyboardInterrupt, typer.Abort):
-        status = 130
+        status = signals.STATUS
     except SystemExit as error:  # typer turns an interrupt into one of these
-        status = error.code
+        status = error.code if isinstance(error.code, int) else int(bool(error.code))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 0
     except Exception as error:
-        status = _unexpected(error, debug)
-    if status == 130:
-        print("Interrupted. Run the same command again to go on from here.", file=sys.stderr)
-    sys.exit(status if isinstance(status, int) else 0)
-
-
-def _interrupt(signum: int, frame: Any) -> None:
-    raise KeyboardInterrupt
+        status = signals.STATUS if signals.asked() else _unexpected(error, debug)
+    return status if isinstance(status, int) else 0
 
 
 def _fail(error: BaseException, status: int, debug: bool) -> int:
@@ -395,12 +446,14 @@ def _fail(error: BaseException, status: int, debug: bool) -> int:
 def _unexpected(error: Exception, debug: bool) -> int:
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # click's usage errors
         return _fail(RequestError(error.format_message()), 2, debug)
-    from pipeline.store import is_disk_full
+    from pipeline.store import file_in_the_way, is_disk_full
 
     if is_disk_full(error, Path.cwd()):
         return _fail(
             RequestError("The disk is full. Make room and run the same command again."), 2, debug
         )
+    if told := file_in_the_way(error):
+        return _fail(told, 2, debug)
     text = f"A fault of ours: {type(error).__name__}: {error}. Run again with --debug to see where."
     if debug:
         raise error
@@ -408,4 +461,4 @@ def _unexpected(error: Exception, debug: bool) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    signals.run(program)

@@ -5,21 +5,23 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.errors import RequestError, did_you_mean, nearest
+from pipeline.errors import RequestError, did_you_mean, nearest, shown
 from pipeline.installed import shipped_configs
 from pipeline.measure import usable_cores
 from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
+from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.plain_yaml import plain_yaml, read_plain_yaml
 
 DEFAULT_PRESET = "dentalsplat"
+#: Parts and letters of a setting's name; presets that extend each other; faults that are explained.
+_MOST_PARTS, _LONGEST_NAME, _LONGEST_CHAIN, _MOST_FAULTS = 8, 200, 20, 5
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -27,7 +29,7 @@ Model = TypeVar("Model", bound=BaseModel)
 class RunConfig(BaseModel):
     """What is not the business of one stage alone."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     stages: tuple[str, ...] = Field(
         min_length=1, description="the stages of a whole run, in order (the preset says them)"
     )
@@ -114,6 +116,8 @@ def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         chain = " -> ".join(entry.name for entry in (*seen, path))
         raise RequestError(f"The presets extend each other in a circle: {chain}.")
+    if len(seen) > _LONGEST_CHAIN:
+        raise RequestError(f"More than {_LONGEST_CHAIN} presets extend each other, up to {path}.")
     tree = read_yaml(path, "preset")
     if not isinstance(tree, dict):
         raise RequestError(f"The preset {path} must be a mapping with a section per stage.")
@@ -127,13 +131,14 @@ def _find_preset(preset: str | Path, seen: tuple[Path, ...]) -> Path:
     known = presets()
     if str(preset) in known:
         return known[str(preset)]
-    path = Path(preset)
+    path = user_path(preset, "the preset")
     if seen and not path.is_absolute():  # a file beside the one that extends it
         path = seen[-1].parent / path
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return path.resolve()
     raise RequestError(
-        f"There is no preset '{preset}'. The presets are {', '.join(known)}; or give a YAML file."
+        f"There is no preset {shown(str(preset))}. The presets are {', '.join(known)}; or "
+        f"give a YAML file."
         f"{nearest(str(preset), known)}"
     )
 
@@ -148,26 +153,9 @@ def read_yaml(path: Path, what: str) -> Any:
         RequestError: it can't be read.
     """
     try:
-        return _yaml(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise RequestError(f"The {what} {path} can't be read: {error}") from error
-
-
-class _YamlLoader(yaml.SafeLoader):
-    """YAML 1.2 booleans: ``on`` and ``off`` are words (several settings have them as values)."""
-
-
-_YamlLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in rules if tag != "tag:yaml.org,2002:bool"]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_YamlLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
-
-
-def _yaml(text: str) -> Any:
-    return yaml.load(text, _YamlLoader)  # a SafeLoader
+        return read_plain_yaml(path, aliases=True)
+    except RequestError as error:
+        raise RequestError(f"The {what} can't be read: {error}") from error
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -182,16 +170,21 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise RequestError(
-            f"--set takes stage.key=value, as 'pipeline stages' lists them; this is '{text}'."
+            f"--set takes stage.key=value, as 'pipeline stages' lists them; this is {shown(text)}."
         )
     try:
-        return key.strip(), _yaml(value)
-    except yaml.YAMLError as error:
-        raise RequestError(f"The value of --set {text} can't be read: {error}") from error
+        return key.strip(), plain_yaml(value, "it")
+    except RequestError as error:
+        raise RequestError(f"The value of --set {shown(text)} can't be read: {error}") from error
 
 
 def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
     *parents, last = dotted.removeprefix("run.").split(".")
+    if len(parents) >= _MOST_PARTS or len(dotted) > _LONGEST_NAME:
+        raise RequestError(
+            f"{shown(dotted)} is no setting: none has a name of so many parts or letters. "
+            "'pipeline settings' lists all."
+        )
     for name in parents:
         child = tree.get(name)
         if not isinstance(child, dict):
@@ -213,9 +206,29 @@ def validate(model: type[Model], values: Any, section: str) -> Model:
     if not isinstance(values, dict):
         raise RequestError(f"The section '{section}' must hold key: value pairs.")
     try:
-        return model.model_validate(values)
+        read = model.model_validate(values)
     except ValidationError as error:
-        raise RequestError(" ".join(_explain(model, section, e) for e in error.errors())) from None
+        faults = error.errors()
+        said = [_explain(model, section, fault) for fault in faults[:_MOST_FAULTS]]
+        more = len(faults) - len(said)
+        said += [f"{more} more settings are wrong."] if more else []
+        raise RequestError(" ".join(said)) from None
+    for dotted, value in _whole_numbers(read, section):
+        if abs(value) >= 2**63:
+            raise RequestError(f"{dotted}={shown(value)} is not allowed: no count is so large.")
+    return read
+
+
+def _whole_numbers(value: Any, dotted: str) -> Iterator[tuple[str, int]]:
+    """Dotted name and value of each whole number in a model."""
+    if isinstance(value, int):
+        yield dotted, value
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            yield from _whole_numbers(entry, dotted)
+    elif isinstance(value, dict | BaseModel):
+        for name, entry in value.items() if isinstance(value, dict) else value:
+            yield from _whole_numbers(entry, f"{dotted}.{name}" if dotted else str(name))
 
 
 def _unknown_section(
@@ -233,13 +246,18 @@ def _unknown_section(
         ]
         near = did_you_mean(dotted, names)
     return RequestError(
-        f"'{name}' is neither a stage nor a setting of a run; known are {', '.join(known)}.{near}"
+        f"{shown(name)} is neither a stage nor a setting of a run; known are "
+        f"{', '.join(known)}.{near}"
     )
 
 
 def _explain(model: type[BaseModel], section: str, error: Any) -> str:
     """Say in one sentence which field is wrong, what is allowed, and what it is for."""
-    location = [str(part) for part in error["loc"] if not str(part).startswith("function-")]
+    location = [
+        str(part) if len(str(part)) <= _LONGEST_NAME else shown(part)
+        for part in error["loc"]
+        if not str(part).startswith("function-")
+    ]
     dotted = ".".join(filter(None, [section, *location]))
     if error["type"] == "extra_forbidden":
         if section not in stage_names():  # a suite, say: few enough to name them all
@@ -255,7 +273,7 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
         )
     about = _description(model, location)
     return (
-        f"{dotted}={error.get('input')!r} is not allowed: {error['msg']}."
+        f"{dotted}={shown(error.get('input'))} is not allowed: {error['msg']}."
         f"{f' It means: {about}' if about else ''}"
     )
 

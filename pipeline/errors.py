@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pipeline.untrusted.names import shown
+from pipeline.untrusted.names import readable
 
 
 class PipelineError(Exception):
@@ -18,7 +18,7 @@ class PipelineError(Exception):
     exit_status = 1
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(shown(message))
+        super().__init__(readable(message))
 
 
 class RequestError(PipelineError):
@@ -56,14 +56,35 @@ class StageError(PipelineError):
     exit_status = 1
 
 
+#: A longer name is nobody's slip, and comparing it would take its time.
+LONGEST_GUESSED = 100
+
+
+def shown(value: object, letters: int = 100) -> str:
+    """A value as the user gave it, short enough for a message."""
+    if isinstance(value, str | list | tuple | dict) and len(value) > 10 * letters:
+        kind = {str: "text", dict: "mapping"}.get(type(value), "list")
+        start = repr(value[:40]) if isinstance(value, str) else "..."
+        return f"{start}... (a {kind} of length {len(value)})"
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # nested too deep; a number of too many digits
+        return f"a {type(value).__name__}"
+    return text if len(text) <= letters else f"{text[:letters]}..."
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing."""
+    if len(name) > LONGEST_GUESSED:
+        return ""
     close = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
 def did_you_mean(wrong: str, names: Iterable[str], count: int = 5) -> str:
     """``" Did you mean fit.iterations, ... or fit.x?"``: the settings nearest to a wrong one."""
+    if len(wrong) > LONGEST_GUESSED:
+        return ""
     last = wrong.rpartition(".")[2]
 
     def likeness(name: str) -> float:

@@ -84,11 +84,14 @@ def _is_running(process: int) -> bool:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Replace a small text file in one step: a reader sees the old content or the new."""
+    """Replace a small text file in one step: a reader sees the old content or the new.
+
+    Names of files that are no text are written as JSON would escape them.
+    """
     temporary = temporary_beside(path)
     try:
-        with temporary.open("w", encoding="utf-8") as stream:
-            stream.write(storable(text))
+        with temporary.open("w", encoding="utf-8", errors="backslashreplace") as stream:
+            stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)

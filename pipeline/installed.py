@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,10 +26,12 @@ def shipped_configs() -> Path:
 def module_command(module: str) -> tuple[str, ...]:
     """The command that runs a module of ours, whatever lies in the folder it is called from.
 
-    ``python -m`` would take a ``pipeline.py`` of the user's there for our package.
+    ``python -m`` would take a ``pipeline.py`` of the user's there for our package. The process is a
+    child of this one, and ends with it (`pipeline.process.signals`).
     """
     script = (
         f"import runpy, sys; sys.path[0] = {str(ROOT)!r}; "
+        f"from pipeline.process.signals import child; child({os.getpid()}); "
         f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
     )
     return (sys.executable, "-c", script)

@@ -135,11 +135,12 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
     """Artifact kind -> where it comes from, as the workspace offers it before the run.
 
     Raises:
-        RequestError: a needed kind is provided by no earlier stage and the workspace has none.
+        RequestError: a needed kind is provided by no earlier stage and the workspace has none, or
+            it can't be told which result is in use.
     """
     table: dict[str, Input] = {}
     for name in chain.upstream:
-        result = store.current(name)
+        result = store.in_use(name)
         for kind in result.contents if result else {}:
             table[kind] = Input(name, kind, result)
     available = set(table)

@@ -23,9 +23,10 @@ from pipeline.planning import (
     provider_table,
     resolve_chain,
 )
+from pipeline.process import signals
 from pipeline.stage import StageContext, get_stage, usable_stages
-from pipeline.store import CorruptResultError, Result, Store, is_disk_full
-from pipeline.untrusted.names import shown
+from pipeline.store import CorruptResultError, Result, Store, file_in_the_way, is_disk_full
+from pipeline.untrusted.names import readable
 from pipeline.workspace import Request
 
 Figure = float | int | str
@@ -141,10 +142,11 @@ class RunContext(StageContext):
         return path
 
     def progress(self, step: str, done: int, total: int, **figures: float | int | str) -> None:
+        signals.check()
         self._reporter.progress(self._planned.name, step, done, total, **figures)
 
     def warn(self, message: str) -> None:
-        message = shown(message)
+        message = readable(message)
         self.warnings.append(message)
         self._reporter.message(f"{self._planned.name}: {message}")
 
@@ -155,11 +157,13 @@ class RunContext(StageContext):
 class Runner:
     """One request on one workspace."""
 
-    def __init__(self, request: Request, config: Config, reporter: Reporter) -> None:
+    def __init__(
+        self, request: Request, config: Config, reporter: Reporter, *, verify: bool = False
+    ) -> None:
         self.request = request
         self.config = config
         self.reporter = reporter
-        self.store = Store(request.workspace)
+        self.store = Store(request.workspace, verify=verify)
         self.chain = resolve_chain(
             config, request.stages, request.from_stage, request.images_named, self.store
         )
@@ -176,7 +180,7 @@ class Runner:
             ReconstructionError: the data can't be reconstructed. StageError: a fault of ours.
         """
         planned = self.plan()  # a wrong request is refused before anything is written
-        self.store.create()
+        self.store.create(self.chain.names)
         self.request.save()
         self.reporter.start(list(self.chain.names))
         try:
@@ -268,6 +272,7 @@ class Runner:
     def _reuse_or_run(self, planned: PlannedStage, force: bool) -> tuple[StageOutcome, Result]:
         name, key = planned.name, planned.key
         assert key is not None, f"{name} was planned before its inputs were there"
+        signals.check()
         if planned.result is not None and not force:
             self.store.use(planned.result, planned.reasons)
             return self._cached(planned.result), planned.result
@@ -329,9 +334,10 @@ class Runner:
                 **measurement.figures,
             }
             return self.store.commit(name, key, manifest, context.outputs)
-        except (KeyboardInterrupt, CorruptResultError):
+        except CorruptResultError:
             raise
         except Exception as error:
+            signals.check()
             raise self._explain_failure(error, name, key) from error
 
     def _thrift(self) -> list[str]:
@@ -352,6 +358,8 @@ class Runner:
             )
         elif isinstance(error, PipelineError):
             failure = error
+        elif told := file_in_the_way(error, self.request.workspace):
+            failure = told
         elif isinstance(error, MemoryError):
             failure = StageError(
                 " ".join([f"The stage '{name}' needs more memory than there is.", *self._thrift()])
@@ -363,12 +371,14 @@ class Runner:
                 f"({Path(where.filename).name}, line {where.lineno}). What earlier stages computed "
                 "is kept. Run again with --debug for the whole trace, and please report it."
             )
-        self.store.discard_outputs(name, key)
+        with contextlib.suppress(OSError):  # the first error is the one to tell
+            self.store.discard_outputs(name, key)
         if isinstance(failure, ReconstructionError):
             folder = self.store.keep_evidence(name, failure.pictures, failure.artifacts)
             if failure.pictures:
                 failure.args = (f"{failure} Pictures that show it: {folder}",)
-        self.store.record_failure(name, key, str(failure))
+        with contextlib.suppress(OSError):
+            self.store.record_failure(name, key, str(failure))
         return failure
 
 

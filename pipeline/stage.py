@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.artifacts import GROUP as ARTIFACTS
 from pipeline.artifacts import KINDS, Artifact, artifact_class, kinds
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import RequestError, nearest, shown
 from pipeline.plugins import Entries, check_name, load, registered
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ Parts = Mapping[str, "Callable[[Case], Iterable[Part]]"]
 class StageConfig(BaseModel):
     """Base of every stage's config: frozen, and unknown keys are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
 
 def runtime(default: Any, **constraints: Any) -> Any:
@@ -263,7 +265,9 @@ def get_stage(name: str) -> Stage:
         )
     if name not in found:
         known = ", ".join(sorted(found))
-        raise RequestError(f"Unknown stage '{name}'. The stages are {known}.{nearest(name, found)}")
+        raise RequestError(
+            f"Unknown stage {shown(name)}. The stages are {known}.{nearest(name, found)}"
+        )
     stage: type[Stage]
     stage, where = load(f"stage '{name}'", found[name], Stage)
     _check(stage, name, where)

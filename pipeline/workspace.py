@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import load_config
-from pipeline.errors import RequestError
-from pipeline.files import read_json, write_json
+from pipeline.errors import PipelineError, RequestError
 from pipeline.planning import plan_chain, resolve_chain
-from pipeline.store import Store
+from pipeline.store import Store, partial_name
+from pipeline.store.places import is_folder, is_there, set_aside
+from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
+
+REQUEST = "request.json"
 
 #: Folders that say nothing about the case inside them; their parent's name does.
 GENERIC_FOLDERS = {"images", "image", "frames", "photos", "photographs", "input", "inputs", "rgb"}
@@ -38,16 +41,49 @@ class Request:
 
     def save(self) -> None:
         """Remember the request in the workspace, for `status` and for runs that name no images."""
-        entry = {
+        entry: dict[str, Any] = {
             "images": list(self.images),
             "preset": self.preset,
             "overrides": list(self.overrides),
             "stages": list(self.stages) if self.stages else None,
             "from": self.from_stage,
         }
-        path = self.workspace / "request.json"
-        if read_json(path) != entry:
-            write_json(path, entry)
+        path = self.workspace / REQUEST
+        try:
+            found = read_record(path, SavedRequest)
+        except DamagedError:
+            found = None
+        if found is None or found.model_dump(by_alias=True) != entry:
+            if is_folder(path):
+                set_aside(path)
+            write_sealed(path, entry)
+
+
+def is_workspace(folder: Path) -> bool:
+    """Has a run been started there, whatever has become of it?"""
+    return is_there(folder / REQUEST)
+
+
+def read_request(folder: Path) -> dict[str, Any]:
+    """What a workspace was asked for last: images, preset, overrides, stages, from.
+
+    Raises:
+        RequestError: it is no workspace, or what it was asked for is not known any more.
+    """
+    try:
+        found = read_record(folder / REQUEST, SavedRequest)
+    except DamagedError as error:
+        raise RequestError(
+            f"{folder / REQUEST} is damaged ({error}): what this workspace was made from is not "
+            f"known any more. Name the photographs and settings once more: pipeline run "
+            f"PHOTOGRAPHS -w {folder}. What was computed is kept and used again."
+        ) from error
+    if found is None:
+        raise RequestError(
+            f"{folder} is not a workspace: no run has been started there. Give the folder that "
+            "'pipeline run' named, with -w."
+        )
+    return found.model_dump(by_alias=True)
 
 
 def make_request(
@@ -65,7 +101,7 @@ def make_request(
     folder = Path(workspace)
     images_named = bool(given)
     if not given:
-        remembered = read_json(folder / "request.json") or {}
+        remembered = read_request(folder) if is_workspace(folder) else {}
         given = [p for p in remembered.get("images", []) if _still_there(p)]
     if isinstance(overrides, Mapping):
         overrides = [f"{key}={_yaml_value(value)}" for key, value in overrides.items()]
@@ -81,7 +117,10 @@ def make_request(
 
 
 def _still_there(path: str) -> bool:
-    return any(c in path for c in "*?[") or Path(path).exists()
+    try:
+        return any(c in path for c in "*?[") or Path(path).exists()
+    except OSError:  # too long a name, a folder of somebody else's
+        return False
 
 
 def _yaml_value(value: Any) -> str:
@@ -135,21 +174,20 @@ def status(
     preset: str | Path | None = None,
     overrides: Iterable[str] | Mapping[str, Any] = (),
     stages: Sequence[str] | None = None,
+    verify: bool = False,
 ) -> list[StageStatus]:
     """Compare a workspace with a request, by default the one it was last asked for.
 
     Given a preset, overrides or stages, it tells what a run with them would find stale.
 
+    Args:
+        verify: read every byte of the results, and not only of those that seem to have changed.
+
     Raises:
         RequestError: there is no such workspace, or the request is wrong.
     """
     request = make_request(images, workspace, preset, overrides, stages)
-    remembered = read_json(request.workspace / "request.json")
-    if not isinstance(remembered, dict):
-        raise RequestError(
-            f"{request.workspace} is not a workspace: no run has been started there. Give the "
-            "folder that 'pipeline run' named, with -w."
-        )
+    remembered = read_request(request.workspace)
     request = make_request(
         request.images,
         request.workspace,
@@ -158,7 +196,7 @@ def status(
         stages or remembered["stages"],
     )
     config = load_config(request.preset, request.overrides)
-    store = Store(request.workspace)
+    store = Store(request.workspace, verify=verify)
     chain = resolve_chain(config, request.stages, request.from_stage, request.images_named, store)
     found = []
     for plan in plan_chain(chain, config, store, request.images):
@@ -178,8 +216,15 @@ def status(
     return found
 
 
-def clean(workspace: str | Path, *, keep: int = 0) -> tuple[list[str], int]:
+def clean(
+    workspace: str | Path, *, keep: int = 0, everything: bool = False
+) -> tuple[list[str], int]:
     """Delete the results that are not in use, but for the `keep` newest of each stage.
+
+    What a stopped run can go on from stays, unless the last request has no use for it.
+
+    Args:
+        everything: delete that too.
 
     Returns:
         What was deleted (``stage/key``), and the bytes freed.
@@ -188,6 +233,32 @@ def clean(workspace: str | Path, *, keep: int = 0) -> tuple[list[str], int]:
         RequestError: there is no such workspace.
     """
     folder = Path(workspace)
-    if read_json(folder / "request.json") is None:
+    if not is_workspace(folder):
         raise RequestError(f"{folder} is not a workspace, so nothing in it was deleted.")
-    return Store(folder).clean(keep)
+    store = Store(folder)
+    return store.clean(keep, () if everything else _useful(folder, store.checkpoints()))
+
+
+def checkpoints(workspace: str | Path) -> dict[str, int]:
+    """Name (``stage/folder``) -> bytes of what stopped runs left to go on from."""
+    return Store(Path(workspace)).checkpoints()
+
+
+def _useful(folder: Path, found: Iterable[str]) -> list[str]:
+    """Those checkpoints that the last request would go on from, or may: all where it can't be
+    told what it would compute."""
+    names = list(found)
+    if not names:
+        return []
+    try:
+        stages = {entry.name: entry for entry in status(workspace=folder)}
+    except PipelineError:
+        return names
+    return [name for name in names if _may_need(stages, name)]
+
+
+def _may_need(stages: Mapping[str, StageStatus], name: str) -> bool:
+    entry = stages.get(name.partition("/")[0])
+    if entry is None:
+        return False
+    return entry.key is None or (entry.resumable and partial_name(entry.key) in name)

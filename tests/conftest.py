@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 import pipeline
 from pipeline.runner import RunSummary
+from tests.personal_data import with_personal_data
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
 SHORT = {
@@ -24,7 +27,29 @@ def short_settings() -> dict[str, int]:
 
 
 @pytest.fixture(scope="session")
-def sample_run(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    """The whole job on the three sample photographs, with a short fit."""
-    folder = tmp_path_factory.mktemp("case") / "w"
-    return pipeline.run(SAMPLES, workspace=folder, overrides=SHORT)
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that processes that test beside each other have in common."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@pytest.fixture(scope="session")
+def named_samples(shared_folder: Path) -> Path:
+    """The three sample photographs with a patient's name in every place, pixels as they are."""
+    folder = shared_folder / "Prognath_Anna"
+    with FileLock(shared_folder / "named_samples.lock"):
+        if not folder.is_dir():
+            folder.mkdir()
+            for photo in sorted(SAMPLES.glob("*.jpg")):
+                name = f"Prognath_Anna_{photo.name}"
+                (folder / name).write_bytes(with_personal_data(photo.read_bytes()))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sample_run(shared_folder: Path, named_samples: Path) -> RunSummary:
+    """The whole job on the three sample photographs, with a short fit; not to be changed.
+
+    Processes that test beside each other share it: one computes a stage, the others wait for it.
+    """
+    return pipeline.run(named_samples, workspace=shared_folder / "sample_run", overrides=SHORT)

@@ -8,6 +8,7 @@ colour behind them, where it is known and not black, is in `background.json`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,6 +18,7 @@ from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
 from pipeline.files import read_json, write_json
+from pipeline.untrusted.scenes.ply import read_cloud
 
 Array = npt.NDArray[np.float32]
 
@@ -125,16 +127,22 @@ def write_gaussians_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_gaussians_ply(path: Path) -> dict[str, Array]:
-    """Read a 3DGS `.ply` of any spherical-harmonics degree 0..3 into the fields of `Gaussians`."""
-    vertex = PlyData.read(str(path))["vertex"].data
-    count = len(vertex)
+    """Read a 3DGS `.ply` of any spherical-harmonics degree 0..3 into the fields of `Gaussians`.
+
+    Raises:
+        RequestError: it is damaged, or lacks a property of these.
+    """
+    always = [n for n in ply_properties() if n[0] != "n" and not n.startswith("f_rest_")]
+    vertex = read_cloud(path, always)
+    count = len(vertex["x"])
 
     def stack(prefix: str, number: int) -> Array:
         return np.stack([vertex[f"{prefix}{k}"] for k in range(number)], -1).astype(np.float32)
 
     sh = np.zeros((count, SH_COEFFICIENTS, 3), np.float32)
     sh[:, 0] = stack("f_dc_", 3)
-    per_channel = sum(name.startswith("f_rest_") for name in vertex.dtype.names) // 3
+    rest_names = takewhile(vertex.__contains__, (f"f_rest_{k}" for k in range(45)))
+    per_channel = len(list(rest_names)) // 3
     if per_channel:
         rest = stack("f_rest_", 3 * per_channel).reshape(count, 3, per_channel)
         sh[:, 1 : 1 + per_channel] = rest.transpose(0, 2, 1)

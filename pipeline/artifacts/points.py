@@ -11,8 +11,12 @@ import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
+from pipeline.untrusted.scenes.ply import read_cloud
 
 Array = npt.NDArray[np.float32]
+
+#: What the file has of each point.
+PROPERTIES = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "confidence", "scale")
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Points(Artifact):
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        vertex = PlyData.read(str(folder / "points.ply"))["vertex"].data
+        vertex = read_cloud(folder / "points.ply", PROPERTIES)
 
         def stack(*names: str) -> Array:
             return np.stack([vertex[name] for name in names], -1).astype(np.float32)
@@ -67,7 +71,7 @@ class Points(Artifact):
 
 def write_points_ply(path: Path, points: Points) -> None:
     """Write binary little-endian PLY: x y z nx ny nz red green blue confidence scale."""
-    names = ["x", "y", "z", "nx", "ny", "nz"]
+    names = PROPERTIES[:6]
     fields = [(n, "<f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")]
     rows = np.empty(len(points), dtype=[*fields, ("confidence", "<f4"), ("scale", "<f4")])
     for axis, (position, normal) in enumerate(zip(names[:3], names[3:], strict=True)):

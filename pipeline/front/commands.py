@@ -8,6 +8,8 @@ from typing import Any
 
 from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError, ReconstructionError, StageError
+from pipeline.front.pages import write_pages
+from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.runner import Reporter, Runner, RunSummary
 from pipeline.stage import get_stage, stage_names
 from pipeline.workspace import make_request
@@ -23,6 +25,8 @@ def run(
     from_stage: str | None = None,
     force: bool = False,
     dry_run: bool = False,
+    verify: bool = False,
+    share: Share | None = None,
     reporter: Reporter | None = None,
 ) -> RunSummary:
     """Run the pipeline on photographs, reusing every result that is still valid.
@@ -37,6 +41,10 @@ def run(
         from_stage: begin here, with what the workspace holds from before.
         force: compute the stages anew although a valid result exists.
         dry_run: only say what would be done.
+        verify: read every byte of the results, and not only of those that seem to have changed.
+        share: who may read the workspace: ``nobody`` else, or the owner's ``group``; None: as it is
+            said of the workspace already. Until the run ends, all that this process writes is kept
+            from others (`pipeline.process.privacy`).
         reporter: hears of the progress.
 
     Raises:
@@ -46,41 +54,27 @@ def run(
     request = make_request(images, workspace, preset, overrides, stages, from_stage)
     config = load_config(request.preset, request.overrides)
     reporter = reporter or Reporter()
-    runner = Runner(request, config, reporter)
+    runner = Runner(request, config, reporter, verify=verify)
     if dry_run:
         return runner.dry_run(force=force)
+    with kept_for(share_for(request.workspace, share)):
+        return _run(runner, request.workspace, config, reporter, force)
+
+
+def _run(
+    runner: Runner, workspace: Path, config: Config, reporter: Reporter, force: bool
+) -> RunSummary:
     try:
         summary = runner.run(force=force)
     except (ReconstructionError, StageError) as error:
-        report, check = _write_pages(request.workspace, config, reporter)
+        report, check = write_pages(workspace, config, reporter)
         if report is not None:
             reporter.message(f"What came of it so far: {report}")
         if check and isinstance(error, ReconstructionError) and error.artifacts:
             error.args = (f"{error} To put it right, open {check} in a browser.",)
         raise
-    summary.report, summary.check = _write_pages(request.workspace, config, reporter)
+    summary.report, summary.check = write_pages(workspace, config, reporter)
     return summary
-
-
-def _write_pages(
-    workspace: Path, config: Config, reporter: Reporter
-) -> tuple[Path | None, Path | None]:
-    """Write the report, and the page to put the teeth right where there are any.
-
-    Whatever goes wrong with it is said, and harms nothing else.
-    """
-    if not config.run.report:
-        return None, None
-    from pipeline.pages.page import CHECK
-    from pipeline.studies.report import run_report
-
-    try:
-        report = run_report(workspace)
-    except Exception as error:
-        reporter.message(f"The report could not be written: {error}")
-        return None, None
-    check = workspace / CHECK
-    return report, check if check.is_file() else None
 
 
 def stages() -> list[dict[str, Any]]:

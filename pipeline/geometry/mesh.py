@@ -10,6 +10,9 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.errors import RequestError
+from pipeline.untrusted.files import UnusableFile
+from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.scenes.meshes import read_mesh
 
 Array = npt.NDArray[np.float64]
 
@@ -48,17 +51,15 @@ class Mesh:
             setting: name of the setting that gave it, for messages.
 
         Raises:
-            RequestError: there is no such file, or it holds no triangles.
+            RequestError: there is no such file, it is damaged, or it holds no triangles.
         """
-        import open3d as o3d
-
-        path = path.expanduser()
-        read = o3d.io.read_triangle_mesh(path) if path.is_file() else None
-        if read is None or not read.has_triangles():
+        path = user_path(path, setting)
+        try:
+            return cls(*read_mesh(path))
+        except UnusableFile as error:
             raise RequestError(
-                f"{setting}: {path} holds no triangle mesh. Give a .ply, .stl or .obj."
-            )
-        return cls(np.asarray(read.vertices), np.asarray(read.triangles))
+                f"{setting}: {path} {error}. Give a triangle mesh as .ply, .stl or .obj."
+            ) from error
 
     def closest(self, points: Array) -> Array:
         """[N, 3] the points of the surface nearest to points [N, 3]."""

@@ -53,8 +53,11 @@ def similarity_between(
 ) -> tuple[float, Array, Array]:
     """Similarity that brings cameras onto others of the same views, as well as it goes.
 
+    The turn is the mean of those of the cameras, so that two of them, or a straight line, are
+    enough. Where all stand at one place the scale stays 1.
+
     Args:
-        cameras, targets: the same views in the same order, at least two.
+        cameras, targets: the same views in the same order, at least one.
 
     Returns:
         (scale, rotation [3, 3], translation [3]) of target = s R camera + t.
@@ -62,8 +65,8 @@ def similarity_between(
     centres = np.array([camera.centre for camera in cameras])
     goals = np.array([camera.centre for camera in targets])
     centre, goal = centres.mean(0), goals.mean(0)
-    spread = np.linalg.norm(centres - centre)
-    scale = float(np.linalg.norm(goals - goal) / spread) if spread > 1e-12 else 1.0
+    spread, wanted = (float(np.linalg.norm(a - b)) for a, b in ((centres, centre), (goals, goal)))
+    scale = wanted / spread if min(spread, wanted) > 1e-12 else 1.0
     # Orientations: R_target = R_camera R^T; the nearest rotation to all of them.
     product = sum(b.rotation.T @ a.rotation for a, b in zip(cameras, targets, strict=True))
     rotation = nearest_rotation(np.asarray(product))

@@ -156,6 +156,7 @@ def _write(path: Path, data: bytes) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         part.write_bytes(hashlib.sha256(data).digest() + data)
+        places.for_all(part)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

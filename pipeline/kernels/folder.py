@@ -57,6 +57,15 @@ def writable() -> Path | None:
     return None
 
 
+def for_all(path: Path) -> None:
+    """What is kept beside the program is for all users, also where root's files are its own."""
+    if path.parent == folders()[0] and not os.environ.get("NUMBA_CACHE_DIR"):
+        for place, mode in ((path.parent, 0o755), (path, 0o644)):
+            with contextlib.suppress(OSError):
+                if place.stat().st_mode & mode != mode:
+                    place.chmod(place.stat().st_mode | mode)
+
+
 def _ours(folder: Path) -> bool:
     """Compiled code is run: nobody else may have put it there."""
     try:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from pipeline.kernels import folder as places
 from pipeline.kernels.folder import SUFFIX
+from pipeline.process.signals import child
 
 #: how much the run itself goes before
 NICENESS = 10
@@ -74,6 +75,7 @@ def hold(name: str) -> None:
     folder = places.writable()
     if folder is not None:
         (folder / _mark(name)).touch()
+        places.for_all(folder / _mark(name))
         places.tidy(folder, f"rehearsed.{name.replace(':', '.')}")
 
 
@@ -115,6 +117,7 @@ def _processor() -> str:
 
 
 def main(names: Sequence[str]) -> None:
+    child()
     with contextlib.suppress(AttributeError):  # Windows has none
         os.nice(NICENESS)
     for name in names:

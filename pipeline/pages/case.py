@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -51,6 +51,11 @@ class StageRecord:
         return self.result is not None and self.state == "cached"
 
 
+def unchanged(value: Any) -> Any:
+    """Hides nothing."""
+    return value
+
+
 @dataclass
 class Case:
     """A workspace as its last request left it.
@@ -62,6 +67,8 @@ class Case:
         settings: the settings of each stage, as the request resolves today; empty where they can't
             be resolved any more. Those of the whole run stand in `run_settings`.
         notes: what could not be found out, in words.
+        hide: takes names out of a text, or out of all texts of a JSON-like value, of a case made
+            `anonymous`; of another it changes nothing.
     """
 
     workspace: Path
@@ -71,6 +78,12 @@ class Case:
     run_settings: BaseModel | None = None
     notes: list[str] = field(default_factory=list)
     _loaded: dict[tuple[str, str], Any] = field(default_factory=dict, repr=False)
+    hide: Callable[[Any], Any] = field(default=unchanged, repr=False)
+
+    @property
+    def nameless(self) -> bool:
+        """It was made `anonymous`: the page is passed on without what lies beside it."""
+        return self.hide is not unchanged
 
     @cached_property
     def by_name(self) -> dict[str, StageRecord]:

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.rigid import angle_between
+from pipeline.geometry.world import similarity_between
 
 Array = npt.NDArray[np.float64]
 
@@ -57,27 +59,8 @@ class Similarity:
 
 
 def similarity_onto(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Similarity:
-    """The similarity that brings cameras onto others of the same views (least squares).
-
-    Rotations come from the mean relative rotation, scale and shift from the centres, so that two
-    cameras, or a straight line of them, are enough (Horn 1987 for the mean of rotations).
-
-    Args:
-        cameras, targets: the same views in the same order, at least one.
-    """
-    total = np.sum(
-        [goal.rotation.T @ camera.rotation for camera, goal in zip(cameras, targets, strict=True)],
-        axis=0,
-    )
-    u, _, vt = np.linalg.svd(total)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    centres = np.array([camera.centre for camera in cameras]) @ rotation.T
-    goals = np.array([camera.centre for camera in targets])
-    a, b = centres - centres.mean(0), goals - goals.mean(0)
-    spread = float((a**2).sum())
-    scale = float((a * b).sum() / spread) if spread > 1e-18 else 1.0
-    scale = scale if scale > 1e-9 else 1.0
-    return Similarity(scale, rotation, goals.mean(0) - scale * centres.mean(0))
+    """`similarity_between`, to be applied to points and cameras."""
+    return Similarity(*similarity_between(cameras, targets))
 
 
 def movement(
@@ -97,8 +80,7 @@ def movement(
     size = float(np.linalg.norm(goals[:, None] - goals[None], axis=-1).max()) or 1.0
     found = []
     for before, goal in pairs:
-        cosine = (np.trace(onto.camera_rotation(before) @ goal.rotation.T) - 1) / 2
-        turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        turn = angle_between(onto.camera_rotation(before), goal.rotation)
         shift = float(np.linalg.norm(onto.points(before.centre[None])[0] - goal.centre))
         found.append((before.name, turn, 100 * shift / size))
     return found

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 
-#: Pages in a workspace: what the last run did, and the teeth to put right where there are any.
-REPORT, CHECK = "report.html", "check.html"
+#: Pages in a workspace: what the last run did, the same without names, and the teeth to put right
+#: where there are any.
+REPORT, ANONYMOUS, CHECK = "report.html", "report_anonymous.html", "check.html"
 
 
 @cache

@@ -311,7 +311,11 @@ def serve(work: Work, memory: int) -> None:
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints goes nowhere
     requests: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    # The parent decides (pipeline.process.signals). It may be any of its threads that started this
+    # process, so that it must not end with that thread: `_listen` ends it with the parent.
+    for name in ("SIGINT", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     confine(memory)
     threading.Thread(target=_listen, args=(requests,), daemon=True).start()
     while True:

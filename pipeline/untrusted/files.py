@@ -79,10 +79,12 @@ def opened(path: Path, kind: Kind) -> Iterator[BufferedReader]:
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         reason = getattr(error, "strerror", None) or str(error)
         raise UnusableFile(f"can't be read ({reason})") from error
+    found = os.fstat(descriptor)
+    sort = sort_of(found.st_mode)
+    if sort is not None:  # before fdopen, which has errors of its own for folders
+        os.close(descriptor)
+        raise UnusableFile(f"is {sort}, not a file")
     with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if (sort := sort_of(found.st_mode)) is not None:
-            raise UnusableFile(f"is {sort}, not a file")
         if found.st_size > kind.most_bytes:
             raise UnusableFile(
                 f"has {found.st_size / 1e6:,.0f} MB, more than {kind.name} may have "
@@ -95,15 +97,17 @@ def read(path: Path, kind: Kind) -> bytes:
     """All bytes of a file of the user's.
 
     Raises:
-        UnusableFile: as `opened`, or it grew beyond its kind's limit while it was read.
+        UnusableFile: as `opened`, or it grew while it was read.
     """
     with opened(path, kind) as file:
         try:
-            data = file.read(kind.most_bytes + 1)
+            # As many as are there: memory is taken for all that are asked for.
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)
         except OSError as error:
             raise UnusableFile(f"can't be read ({error.strerror or error})") from error
-    if len(data) > kind.most_bytes:
-        raise UnusableFile(f"has more bytes than {kind.name} may have ({kind.most_bytes:,})")
+    if len(data) > size:
+        raise UnusableFile(f"grew while it was read (it had {size:,} bytes)")
     return data
 
 

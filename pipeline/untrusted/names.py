@@ -30,7 +30,7 @@ def printable(name: str | os.PathLike[str]) -> str:
     return "".join(_shown(character) for character in text)
 
 
-def shown(text: str) -> str:
+def readable(text: str) -> str:
     """A text that may hold names: as `printable`, with its line ends."""
     return "\n".join(map(printable, text.split("\n")))
 

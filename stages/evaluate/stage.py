@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageContext
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.paths import user_path
 from stages.evaluate.config import EvaluateConfig
 
 #: Suffixes of masks.
@@ -60,7 +61,7 @@ class EvaluateStage(Stage):
 
 
 def _mesh_file(config: Any) -> Path:
-    path = Path(config.mesh).expanduser()
+    path = user_path(config.mesh, "evaluate.mesh")
     if not path.is_file():
         raise RequestError(f"evaluate.mesh: there is no file {path}. Give a mesh as .ply.")
     if config.ground_truth is None:
@@ -72,7 +73,7 @@ def _mesh_file(config: Any) -> Path:
 
 
 def _mask_files(folder: str) -> list[Path]:
-    path = Path(folder).expanduser()
+    path = user_path(folder, "evaluate.masks")
     if not path.is_dir():
         raise RequestError(
             f"evaluate.masks: there is no folder {path}. Give the folder of masks named as the "

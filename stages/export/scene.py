@@ -13,21 +13,9 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views, to_uint8
 from stages.export.frame import move_cameras, move_gaussians, move_points
-from stages.export.pictures.orbits import Orbit, between, central_depth, find_orbit, there_and_back
+from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, there_and_back
 from stages.export.pictures.video import even
 from stages.export.splats import opacities
-from stages.export.surface import (
-    DEEPEST_OCTREE,
-    Mesh,
-    drop_small_parts,
-    fuse_depths,
-    keep_near,
-    poisson,
-    repair,
-    smoothed,
-    spacing,
-    trusted_depth,
-)
 from stages.splatting.rendering import RenderedView, render
 
 Progress = Callable[..., None]
@@ -35,15 +23,6 @@ Pixels = npt.NDArray[np.uint8]
 
 #: constant of the spherical harmonics: colour = .5 + SH_CONSTANT * f_dc
 SH_CONSTANT = 0.28209479177387814
-#: A mesh with fewer triangles than this is no mesh of anything.
-FEWEST_FACES = 100
-#: The mesh needs a trusted point within this many of their spacings, or this many voxels.
-SUPPORT_REACH = 4.0
-SUPPORT_VOXELS = 6.0
-#: Connected parts of the mesh smaller than this share of the largest are dropped.
-SMALLEST_PART = 0.02
-#: Holes of up to this many edges are closed.
-LARGEST_HOLE = 40
 
 
 @dataclass(frozen=True)
@@ -147,71 +126,3 @@ def thinned(points: Points, most: int, seed: int) -> Points:
     if len(index) > most:
         index = np.sort(np.random.default_rng(seed).choice(index, most, replace=False))
     return points[index]
-
-
-def build_mesh(
-    scene: Scene,
-    method: str,
-    resolution: int,
-    smoothing: float,
-    between_views: int,
-    reach_behind: float,
-    confidence: float,
-    most_faces: int,
-    progress: Progress,
-) -> Mesh | None:
-    """Reconstruct the surface, clean and simplify it.
-
-    Args:
-        scene: what to mesh.
-        method: ``tsdf`` or ``poisson``.
-        resolution: voxels across what a photograph shows.
-        smoothing: voxels that the Poisson refit of the fused surface evens out; 0: no refit.
-        between_views: further viewpoints to fuse.
-        reach_behind: how far behind the scene's centre, in half widths of a photograph.
-        confidence: points above it support the mesh.
-        most_faces: triangles, at most.
-        progress: called with (step, done, total).
-
-    Returns:
-        The mesh, or None if there is too little to make one of.
-    """
-    orbit = scene.orbit
-    voxel = 2 * orbit.radius / resolution
-    steps = len(scene.seen) + between_views + 3
-    trusted = scene.points[scene.points.confidence > confidence]
-    if len(trusted) < FEWEST_FACES:
-        return None
-    reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * spacing(trusted.positions))
-    if method == "poisson":
-        oriented = trusted[np.linalg.norm(trusted.normals, axis=1) > 0.5]
-        if len(oriented) < FEWEST_FACES:
-            return None
-        depth = int(np.clip(np.ceil(np.log2(resolution)), 5, DEEPEST_OCTREE))
-        surface, _ = poisson(oriented.positions, oriented.normals, oriented.colors, depth)
-    else:
-
-        def frames():  # type: ignore[no-untyped-def]
-            extra = between(orbit, scene.cameras, between_views) if between_views else []
-            for index, camera in enumerate([*scene.cameras, *extra]):
-                progress("mesh", index, steps)
-                seen = scene.seen[index] if index < len(scene.seen) else scene.render(camera)
-                eye_to_centre = float(np.linalg.norm(camera.centre - orbit.centre))
-                farthest = eye_to_centre + reach_behind * orbit.radius
-                depth = trusted_depth(seen.depth, seen.alpha, farthest)
-                if camera.name in scene.masks:
-                    depth = np.where(scene.masks[camera.name], depth, np.float32(0))
-                yield camera, to_uint8(seen.image), depth
-
-        surface = fuse_depths(frames(), voxel, 5 * voxel)
-    progress("mesh", steps - 3, steps)
-    surface = drop_small_parts(keep_near(surface, trusted.positions, reach), SMALLEST_PART)
-    if len(surface) >= FEWEST_FACES and method == "tsdf" and smoothing:
-        surface = smoothed(surface, smoothing * voxel)
-    if len(surface) < FEWEST_FACES:
-        return None
-    progress("mesh", steps - 2, steps)
-    surface = drop_small_parts(surface, SMALLEST_PART)
-    surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE), SMALLEST_PART)
-    progress("mesh", steps, steps)
-    return surface if len(surface) >= FEWEST_FACES else None

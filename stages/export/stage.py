@@ -18,8 +18,8 @@ from pipeline.stage import Parts, Stage, StageConfig, StageContext
 if TYPE_CHECKING:
     from pipeline.artifacts.teeth import Teeth
     from pipeline.artifacts.views import Views
+    from stages.export.mesh.surface import Mesh
     from stages.export.scene import Scene
-    from stages.export.surface import Mesh
 
 
 class ExportConfig(StageConfig):
@@ -109,8 +109,9 @@ class ExportStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.gaussians import write_gaussians_ply
-        from stages.export.mesh_files import write_mesh_ply, write_stl
-        from stages.export.scene import assemble, build_mesh
+        from stages.export.mesh.building import MeshHere, MeshProcess, mesh_task
+        from stages.export.mesh.files import write_mesh_ply, write_stl
+        from stages.export.scene import assemble
 
         config: ExportConfig = context.config
         views, cameras = context.load("views"), context.load("cameras")
@@ -140,26 +141,35 @@ class ExportStage(Stage):
             counts["colmap_points"] = _write_cameras(context, scene, folder, units)
         if context.has("teeth"):
             counts |= _write_teeth(context, views, scene, folder, config.frame, units)
-        mesh = None
+        task = None
         if config.mesh:
-            mesh = build_mesh(
+            task = mesh_task(
                 scene, config.mesh_method, config.mesh_resolution, config.mesh_smoothing,
                 config.mesh_views, config.mesh_depth, config.mesh_confidence, config.mesh_faces,
                 context.progress,
             )  # fmt: skip
-            if mesh is None:
-                skipped["mesh.ply, mesh.stl"] = "too little surface for a mesh"
-                context.warn(
-                    "No mesh was made: too little of the surface is known. More photographs that "
-                    "overlap would help; the other exports are complete."
-                )
-            else:
-                write_mesh_ply(folder / "mesh.ply", mesh)
-                write_stl(folder / "mesh.stl", mesh)
-                counts["mesh_faces"] = len(mesh)
-        if config.video:
-            counts["video_frames"] = _write_video(context, scene, folder)
-        page_bytes = _write_page(context, scene, folder) if config.viewer else 0
+        maker: MeshHere | MeshProcess
+        if task is None or context.threads == 1:
+            maker = MeshHere(task)
+        else:
+            maker = MeshProcess(task, context.scratch)
+        with maker as making:
+            frames = _write_video(context, scene, folder) if config.video else None
+            page_bytes = _write_page(context, scene, folder) if config.viewer else 0
+            context.progress("mesh", 0, 1)
+            mesh = making.result()
+        if mesh is not None:
+            write_mesh_ply(folder / "mesh.ply", mesh)
+            write_stl(folder / "mesh.stl", mesh)
+            counts["mesh_faces"] = len(mesh)
+        elif config.mesh:
+            skipped["mesh.ply, mesh.stl"] = "too little surface for a mesh"
+            context.warn(
+                "No mesh was made: too little of the surface is known. More photographs that "
+                "overlap would help; the other exports are complete."
+            )
+        if frames is not None:
+            counts["video_frames"] = frames
         if config.preview:
             _write_preview(context, scene, mesh, folder)
         _describe(scene, folder, config.frame, units, counts, skipped, self.libraries)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.errors import RequestError
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
+    from stages.splatting.rasterizer import Viewpoint
 
 #: the card's image may differ by this much from the processor's (mean over the pixels), and its
 #: gradients by this share: sums in another order do, a wrong convention does by far more
@@ -31,9 +34,12 @@ def has_card() -> bool:
 def expected_backend(config: Any) -> str:
     """What a fit with this `FitConfig` will run on here: ``"cpu"``, or gsplat on which card.
 
-    Only a card that turns out to be out of order is not foreseen; the fit then says so.
+    A card that is out of order doesn't count, so that what the processor makes in its place is
+    never taken for the card's.
     """
     if config.backend == "cpu" or _obstacle(config) is not None:
+        return "cpu"
+    if config.backend == "auto" and card_trouble() is not None:
         return "cpu"
     import torch
 
@@ -53,7 +59,7 @@ def use_backend(trainer: Trainer) -> str | None:
     s = trainer.settings
     if s.backend == "cpu" or (s.backend == "auto" and not has_card()):
         return None
-    why = _obstacle(s) or _disagreement(trainer)
+    why = _obstacle(s) or card_trouble()
     if why is None:
         trainer.rasterize = _card()
         return None
@@ -82,21 +88,16 @@ def _card() -> Any:
     return rasterize_on_card
 
 
-def _disagreement(trainer: Trainer) -> str | None:
-    """What is different on the card in the first view, or None."""
+@cache
+def card_trouble() -> str | None:
+    """What the card draws or derives otherwise than the processor, of a trial scene; or None."""
     from stages.splatting.rasterizer import rasterize
 
-    target = trainer.targets[0][1]
-    viewpoint = trainer.viewpoint(0, target)
-    trainer.shade(viewpoint)
-    last = len(trainer.targets) - 1
-    options: dict[str, Any] = {
-        "degree": trainer.degree(), "near": trainer.settings.near, "depth": True,
-        "flow_to": trainer.viewpoint(last, trainer.targets[last][1]),
-    }  # fmt: skip
+    packed, here, there = _trial_scene()
+    options: dict[str, Any] = {"degree": 3, "near": 0.2, "depth": True, "flow_to": there}
     try:
-        ours = rasterize(trainer.packed, viewpoint, **options)
-        theirs = _card()(trainer.packed, viewpoint, **options)
+        ours = rasterize(packed, here, **options)
+        theirs = _card()(packed, here, **options)
         off = float(np.abs(ours.planes[:4] - theirs.planes[:4]).mean())
         if not off < IMAGE_TOLERANCE:
             return f"its images differ from the processor's by {off:.2g} on average"
@@ -113,3 +114,22 @@ def _disagreement(trainer: Trainer) -> str | None:
         if not share < GRADIENT_TOLERANCE:
             return f"its gradients ({name}) differ from the processor's by {share:.1%}"
     return None
+
+
+def _trial_scene() -> tuple[npt.NDArray[np.float32], Viewpoint, Viewpoint]:
+    """Gaussians of all sizes, before and behind each other, and two cameras."""
+    from stages.splatting.rasterizer import Viewpoint
+
+    random, count = np.random.default_rng(0), 2000
+    packed = np.concatenate(
+        [
+            random.uniform(-1, 1, (count, 2)), random.uniform(1, 3, (count, 1)),
+            random.normal(size=(count, 4)), np.log(random.uniform(0.02, 0.2, (count, 3))),
+            random.normal(size=(count, 1)), random.normal(0, 0.3, (count, 48)),
+        ], 1,
+    ).astype(np.float32)  # fmt: skip
+    poses = np.tile(np.eye(4, dtype=np.float32)[:3], (2, 1, 1))
+    poses[1, 0, 3] = 0.05
+    lens = np.array([180, 170, 95, 62], np.float32)
+    here, there = (Viewpoint(pose.copy(), lens, 192, 128) for pose in poses)
+    return packed, here, there

@@ -5,9 +5,12 @@ A killed run goes on from the checkpoint, to the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,12 @@ import numpy as np
 
 from pipeline.artifacts.views import write_png
 from stages.fit.arrays import Arrays, Floats
+
+#: What numpy and zipfile raise for a file of which any byte may be wrong.
+_UNREADABLE = (
+    OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError,
+    MemoryError, OverflowError, SyntaxError, struct.error, zlib.error,
+)  # fmt: skip
 
 COLUMNS = ("iteration", "loss", "psnr", "gaussians")
 
@@ -40,11 +49,21 @@ def save_checkpoint(path: Path, arrays: Arrays, facts: dict[str, Any]) -> None:
     """Write arrays and JSON facts in one `.npz`, atomically: the old file or the new one."""
     temporary = path.with_name(path.name + ".tmp")
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    whole = {**arrays, "_facts": text}
     with temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, _facts=text, **arrays)
+        np.savez(file, allow_pickle=False, _digest=_digest(whole), **whole)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def _digest(arrays: Arrays) -> Any:
+    """SHA-256 of names, types, shapes and bytes: zip's own checks leave gaps."""
+    found = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        found.update(repr((name, str(array.dtype), array.shape)).encode())
+        found.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
+    return np.frombuffer(found.digest(), np.uint8)
 
 
 def load_checkpoint(path: Path) -> tuple[Arrays, dict[str, Any]] | None:
@@ -52,7 +71,9 @@ def load_checkpoint(path: Path) -> tuple[Arrays, dict[str, Any]] | None:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
+        if not np.array_equal(arrays.pop("_digest"), _digest(arrays)):
+            return None
         facts = json.loads(arrays.pop("_facts").tobytes().decode())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except _UNREADABLE:
         return None
     return arrays, facts

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pipeline.stage import StageConfig, runtime
+from pipeline.untrusted.paths import user_path
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.sfm.options import RefinementOptions
@@ -162,7 +163,10 @@ class PointmapConfig(StageConfig):
         """The fields that are paths of the user's."""
         names = ("checkpoint", "package_folder", "files")
         given = {name: getattr(self, name) for name in names}
-        return {name: Path(path).expanduser() if path else None for name, path in given.items()}
+        return {
+            name: user_path(path, f"init.pointmap.{name}") if path else None
+            for name, path in given.items()
+        }
 
 
 class ToothConfig(StageConfig):

@@ -101,7 +101,7 @@ def teeth(case: Case) -> Iterator[Section]:
             caption = ". ".join([said, *(doubt.rstrip(".") for doubt in view.doubts)]) + "."
             drawn.append(picture(image, said, caption, 900))
     told = Text("What was taken for which tooth, by FDI number.")
-    if (case.workspace / CHECK).is_file():
+    if (case.workspace / CHECK).is_file() and not case.nameless:
         told = Text(f"{told.text} Something is wrong?", link=(CHECK, "Put it right", "."))
     blocks: list[Block] = [told, *([Grid(drawn, "wide")] if drawn else [])]
     aside = [

@@ -17,10 +17,10 @@ copy.
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,12 +28,16 @@ import numpy.typing as npt
 from pipeline.artifacts.pointmaps import PointmapPair
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError, nearest
+from pipeline.untrusted.arrays import read_arrays
+from pipeline.untrusted.files import UnusableFile
 from stages.pointmaps.prepare import clean_map, resample_map
 
 #: What a file must hold.
 KEYS = ("points_i", "points_j_in_i", "confidence_i", "confidence_j")
 #: Shapes differ if their aspects do by more than this (rounding to whole pixels differs less).
 _SAME_ASPECT = 0.01
+#: OpenCV resamples no larger ones.
+_MOST_PIXELS = 32_000
 
 Matrix = npt.NDArray[np.float64]
 
@@ -99,7 +103,11 @@ def match_names(files: Sequence[Path], views: Sequence[View], meaning: str) -> l
         best = max(attempts.values(), key=lambda found: sum(one is not None for one in found))
         worst = best.index(None)
         given = stated[worst]
-        what = f"the names {given[0]} and {given[1]}" if given else "no names, and its file name"
+        what = (
+            f"the names {given[0][:80]} and {given[1][:80]}"
+            if given
+            else "no names, and its file name"
+        )
         allowed = sorted({name for known in keys.values() for name in known})
         near = nearest(given[0], allowed) if given else ""
         raise RequestError(
@@ -147,12 +155,15 @@ def _by_source(views: Sequence[View]) -> dict[str, int]:
 
 
 def _stated_names(path: Path) -> tuple[str, str] | None:
-    with _opened(path) as data:
-        if "names" not in data:
-            return None
-        names = [str(name) for name in np.atleast_1d(data["names"])]
-    if len(names) != 2:
-        raise RequestError(f"{path}: the array names holds {len(names)} names instead of 2.")
+    arrays, _ = _arrays(path, ("names",))
+    if "names" not in arrays:
+        return None
+    given = np.atleast_1d(arrays["names"])
+    if given.dtype.kind not in "US":
+        raise RequestError(f"{path}: the array names holds {given.dtype}, not names.")
+    if given.shape != (2,):
+        raise RequestError(f"{path}: the array names holds {given.size} names instead of 2.")
+    names = [name.decode("latin-1") if isinstance(name, bytes) else name for name in given.tolist()]
     return names[0], names[1]
 
 
@@ -171,30 +182,29 @@ def _lookup(
     return found[0] if len(found) == 1 else None
 
 
-def _opened(path: Path):  # type: ignore[no-untyped-def]  # numpy's own type is private
+def _arrays(path: Path, wanted: Iterable[str]) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
     try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise RequestError(f"{path} can't be read as .npz ({error}); write it again.") from error
+        return read_arrays(path, wanted)
+    except UnusableFile as error:
+        raise RequestError(f"{path} {error}; write it again.") from error
 
 
 def _read(one: PairFile, first: View, second: View, edge_jump: float) -> PointmapPair:
-    with _opened(one.path) as data:
-        missing = [key for key in KEYS if key not in data]
-        if missing:
-            raise RequestError(
-                f"{one.path} lacks {', '.join(missing)}; it holds {', '.join(sorted(data))}."
-            )
-        try:
-            arrays = {key: np.asarray(data[key], np.float32) for key in KEYS}
-            transforms = {
-                key: np.asarray(data[key], np.float64)
-                for key in ("transform_i", "transform_j")
-                if key in data
-            }
-            origin = str(data["transform_from"]) if "transform_from" in data else "working"
-        except (ValueError, zipfile.BadZipFile) as error:
-            raise RequestError(f"{one.path} can't be read ({error}); write it again.") from error
+    matrices = ("transform_i", "transform_j")
+    found, names = _arrays(one.path, (*KEYS, *matrices, "transform_from"))
+    missing = [key for key in KEYS if key not in found]
+    if missing:
+        raise RequestError(
+            f"{one.path} lacks {', '.join(missing)}; it holds {', '.join(names)[:400]}."
+        )
+    for key in (*KEYS, *matrices):
+        if key in found and found[key].dtype.kind not in "biuf":
+            raise RequestError(f"{one.path}: {key} holds {found[key].dtype}, not numbers.")
+    with np.errstate(over="ignore"):
+        arrays = {key: np.asarray(found[key], np.float32) for key in KEYS}
+    transforms = {key: np.asarray(found[key], np.float64) for key in matrices if key in found}
+    said = found.get("transform_from", np.array("working"))
+    origin = str(said.item())[:40] if said.size == 1 else f"{said.size} words"
     if origin not in ("working", "source"):
         raise RequestError(f"{one.path}: transform_from is '{origin}', not working or source.")
     maps = []
@@ -205,8 +215,11 @@ def _read(one: PairFile, first: View, second: View, edge_jump: float) -> Pointma
         confidence = arrays[f"confidence_{suffix}"]
         _check(one.path, suffix, points, confidence)
         matrix = transforms.get(f"transform_{suffix}")
-        if matrix is not None and (matrix.shape != (3, 3) or not np.isfinite(matrix).all()):
-            raise RequestError(f"{one.path}: transform_{suffix} is not a 3x3 matrix of numbers.")
+        if matrix is not None and not _is_affine(matrix):
+            raise RequestError(
+                f"{one.path}: transform_{suffix} is not an affine 3x3 matrix of numbers that can "
+                "be inverted."
+            )
         if matrix is not None and origin == "source":
             matrix = matrix @ np.linalg.inv(view.working_from_source)
         points, confidence = clean_map(points, confidence)
@@ -221,6 +234,14 @@ def _read(one: PairFile, first: View, second: View, edge_jump: float) -> Pointma
     return PointmapPair(first.name, second.name, maps[0][0], maps[1][0], maps[0][1], maps[1][1])
 
 
+def _is_affine(matrix: npt.NDArray[np.float64]) -> bool:
+    """Whether it is [3, 3], takes pixels to pixels, and back."""
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    away = bool(np.abs(matrix).max() > 1e9)
+    return not away and matrix[2].tolist() == [0, 0, 1] and abs(np.linalg.det(matrix)) > 1e-12
+
+
 def _check(
     path: Path, suffix: str, points: npt.NDArray[np.float32], confidence: npt.NDArray[np.float32]
 ) -> None:
@@ -228,6 +249,11 @@ def _check(
         raise RequestError(
             f"{path}: the points of {suffix} have the shape {points.shape} and their confidence "
             f"{confidence.shape}; [h, w, 3] and [h, w] are expected."
+        )
+    if not 2 <= min(confidence.shape) <= max(confidence.shape) <= _MOST_PIXELS:
+        raise RequestError(
+            f"{path}: the maps of {suffix} have {confidence.shape[1]}x{confidence.shape[0]} "
+            f"pixels; from 2 to {_MOST_PIXELS} a side are possible."
         )
     finite = confidence[np.isfinite(confidence)]
     if len(finite) and finite.max() <= 1 and finite.min() < 1:

@@ -13,7 +13,7 @@ import pytest
 import pipeline
 from pipeline.errors import RequestError
 from pipeline.files import canonical_json, read_json, sha256_text, write_json
-from pipeline.untrusted.names import printable, shown, storable
+from pipeline.untrusted.names import printable, readable, storable
 from pipeline.workspace import default_workspace
 from stages.views.find import find_images, find_masks
 
@@ -53,7 +53,7 @@ def test_printable(name: bytes, text: str) -> None:
 
 
 def test_messages_keep_their_lines() -> None:
-    assert shown("one\ntwo \x1b") == "one\ntwo \\x1b"
+    assert readable("one\ntwo \x1b") == "one\ntwo \\x1b"
     assert str(RequestError("caf\udce9")) == "caf\\xe9"
 
 

@@ -1,48 +1,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import toy
+from toy_fixtures import run, toys
 
-import pipeline
-from pipeline.artifacts import KINDS
-from pipeline.stage import get_stage
-
-
-@pytest.fixture
-def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
-    """Toy stages registered, and a folder with a preset and three input files."""
-    monkeypatch.setitem(KINDS, "numbers", "toy:Numbers")
-    monkeypatch.setattr("pipeline.stage._entry_points", lambda: toy.STAGES)
-    get_stage.cache_clear()
-    (tmp_path / "toy.yaml").write_text(f"stages: {toy.ORDER}\n")
-    images = tmp_path / "images"
-    images.mkdir()
-    for index, value in enumerate((1, 2, 4)):
-        (images / f"{index}.txt").write_text(str(value))
-    yield tmp_path
-    get_stage.cache_clear()
-
-
-@pytest.fixture
-def run(toys: Path) -> Callable[..., Any]:
-    """Run the toy pipeline in its workspace; returns stage -> action."""
-
-    def call(*overrides: str, **options: Any) -> dict[str, str]:
-        summary = pipeline.run(
-            options.pop("images", toys / "images"),
-            workspace=toys / "w",
-            preset=toys / "toy.yaml",
-            overrides=overrides,
-            **options,
-        )
-        return {stage.name: stage.action for stage in summary.stages}
-
-    return call
+__all__ = ["run", "toys"]

@@ -173,6 +173,7 @@ if __name__ == "__main__":  # the command line, on toy stages: python toy.py run
     sys.modules["toy"] = sys.modules["__main__"]
     install()
     os.environ.setdefault("COLUMNS", "200")
-    from pipeline.cli import main
+    from pipeline.cli import program
+    from pipeline.process import signals
 
-    main()
+    signals.run(program)

@@ -17,12 +17,15 @@ from pipeline.artifacts.teeth import Crown, Dentition
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 
-AXIS = 26.0  # the arches curve around (0, y, -AXIS)
+#: The arches curve around (0, y, -AXIS). It is no anatomy that the code assumes: a narrower arch
+#: (its charts lie around 26), flatter crowns (2.6) and a camera further away (125 mm).
+AXIS = 24.0
+BULGE = 2.1
 WIDTH, HEIGHT = 200, 120
-FOCAL = 430.0
-DISTANCE = 125.0
+FOCAL = 495.0
+DISTANCE = 145.0
 TEETH = {"upper": teeth_of("upper")[3:11], "lower": teeth_of("lower")[3:11]}
-CROWN_ANGLE = 0.27  # radians per crown: 7 mm on a radius of 26
+CROWN_ANGLE = 0.29  # radians per crown: 7 mm on a radius of 24
 CROWN_HEIGHT = 8.0
 GUM = np.array([0.72, 0.36, 0.36])
 GLOVE = np.array([0.93, 0.88, 0.84])
@@ -50,8 +53,8 @@ class JawModel:
         across = np.mod(angle / CROWN_ANGLE + len(TEETH[self.jaw]) / 2, 1.0) * 2 - 1
         along = self.up * (y - self.edge)  # mm from the biting edge
         arched = CROWN_HEIGHT - 1.8 * across**2
-        bump = 1.2 * (1 - np.abs(across) ** 2.6) * np.clip(1.3 - 0.05 * (along - 5) ** 2, 0, 1)
-        radius = self.radius + np.where(along < arched, bump, 0.4 * (1 - np.abs(across) ** 2.6))
+        bump = 1.2 * (1 - np.abs(across) ** BULGE) * np.clip(1.3 - 0.05 * (along - 5) ** 2, 0, 1)
+        radius = self.radius + np.where(along < arched, bump, 0.4 * (1 - np.abs(across) ** BULGE))
         inside = np.abs(angle) < CROWN_ANGLE * len(TEETH[self.jaw]) / 2
         kind = np.where(along < arched, 2, 1)
         return radius, np.where((along > 0) & inside, kind, 0)
@@ -76,7 +79,7 @@ class JawModel:
         return marks
 
 
-JAWS = (JawModel("upper", 26.0, 0.0), JawModel("lower", 23.5, 1.0))
+JAWS = (JawModel("upper", 24.0, 0.0), JawModel("lower", 21.5, 1.0))
 
 
 def texture(points: np.ndarray) -> np.ndarray:

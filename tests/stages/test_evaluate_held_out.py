@@ -14,8 +14,8 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import HeldOut, View, Views, to_uint8, write_png
 from pipeline.errors import RequestError
-from pipeline.geometry.models.known_cameras import OPENCV_FROM_OPENGL
 from pipeline.stage import LocalContext
+from pipeline.untrusted.scenes.transforms import OPENCV_FROM_OPENGL
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.stage import EvaluateStage
 from stages.splatting import render

@@ -6,9 +6,8 @@ import numpy as np
 import open3d
 
 from pipeline.artifacts.cameras import Camera
-from stages.export.mesh_files import write_mesh_ply, write_stl
-from stages.export.pictures.orbits import look_at
-from stages.export.surface import (
+from stages.export.mesh.files import write_mesh_ply, write_stl
+from stages.export.mesh.surface import (
     Mesh,
     drop_small_parts,
     face_normals,
@@ -19,6 +18,7 @@ from stages.export.surface import (
     smoothed,
     trusted_depth,
 )
+from stages.export.pictures.orbits import look_at
 
 VOXEL = 0.04
 

@@ -51,6 +51,14 @@ def test_the_card_is_handed_the_same_scene(degree: int, depth: bool, flow: bool)
         assert np.abs(expected - got).max() <= 1e-4 * np.abs(expected).max(), name
 
 
+@pytest.fixture(autouse=True)
+def fresh_trial():
+    """Each test's card is tried anew."""
+    backend.card_trouble.cache_clear()
+    yield
+    backend.card_trouble.cache_clear()
+
+
 def fitted(tmp_path, **config):
     views, cameras, points, _ = case(lit=True)
     here = context(tmp_path, views, cameras, points, light="camera", iterations=30, **config)
@@ -105,8 +113,13 @@ def test_the_key_says_what_a_fit_runs_on(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(backend, "has_card", lambda: False)
     assert stage.backend(stage.Config()) == "cpu"
     monkeypatch.setattr(backend, "has_card", lambda: True)
+    monkeypatch.setattr(backend, "_card", lambda: STAND_IN)
     monkeypatch.setattr(backend, "version", lambda name: "1.0")
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Card 9")
     assert stage.backend(stage.Config()) == "Card 9, gsplat 1.0, torch 1.0"
     assert stage.backend(stage.Config(backend="cpu")) == "cpu"
     assert stage.backend(stage.Config(optimize_focal=True)) == "cpu"
+    backend.card_trouble.cache_clear()
+    monkeypatch.setattr(backend, "_card", lambda: out_of_order)
+    assert stage.backend(stage.Config()) == "cpu"
+    assert stage.backend(stage.Config(backend="gsplat")) == "Card 9, gsplat 1.0, torch 1.0"

@@ -245,7 +245,7 @@ def test_accuracy_and_completeness_on_a_mesh(tmp_path):
 
 
 def test_a_mesh_that_cant_be_used_is_refused(tmp_path):
-    with pytest.raises(RequestError, match="holds no triangle mesh"):
+    with pytest.raises(RequestError, match="Give a triangle mesh"):
         clouds.read_surface(tmp_path / "none.ply", [])
     mesh = open3d.geometry.TriangleMesh.create_sphere(1)
     mesh.translate([1000, 0, 0])

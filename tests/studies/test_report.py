@@ -90,7 +90,7 @@ def test_a_damaged_picture_costs_only_its_part(tmp_path: Path) -> None:
     (cloud,) = (workspace / "sap").glob("*/points/points.ply")
     cloud.write_bytes(cloud.read_bytes()[:100].ljust(cloud.stat().st_size, b"\0"))
     page = run_report(workspace).read_text()
-    assert "The part 'points' could not be drawn" in text_of(page)
+    assert "The cached result sap/sap000000000 is damaged (points/points.ply" in text_of(page)
     assert {"Photographs", "Matches", "Flow", "Figures"} <= set(sections_of(page))
 
 

@@ -25,8 +25,9 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pipeline.artifacts.dental.fdi import ALL_TEETH
-from pipeline.artifacts.dental.plain_yaml import read_plain_yaml
 from pipeline.errors import RequestError, nearest
+from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.plain_yaml import read_plain_yaml
 
 #: Name of the file in the workspace that is used by itself.
 CORRECTIONS = "teeth.yaml"
@@ -103,7 +104,7 @@ def corrections_file(
         RequestError: the file named is not there.
     """
     if isinstance(setting, str | Path) and str(setting):
-        path = Path(setting).expanduser()
+        path = user_path(setting, named)
         if not path.is_file():
             raise RequestError(f"{named}: there is no file {path}.")
         return path

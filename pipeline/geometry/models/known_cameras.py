@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -15,15 +14,20 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, to_uint8
 from pipeline.errors import RequestError
-from pipeline.geometry.models.colmap import check_whole, quiet_pycolmap
+from pipeline.geometry.models.colmap import quiet_pycolmap
+from pipeline.untrusted.files import UnusableFile
+from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.scenes.cameras import Lens, PosedLens, check_pose
+from pipeline.untrusted.scenes.colmap import Pose, read_cloud, read_model
+from pipeline.untrusted.scenes.transforms import read_transforms
 
 Array = npt.NDArray[np.float64]
 
 COLMAP_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-#: OpenGL cameras (y up, z back), which `transforms.json` holds, to OpenCV cameras.
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 #: What messages call the cameras where no setting is named.
 SETTING = "cameras"
+#: How far the poses that a COLMAP model says twice may be apart, where they are written in digits.
+_POSES_AGREE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
     Raises:
         RequestError: there is nothing of the kind.
     """
-    path = path.expanduser()
+    path = user_path(path, setting)
     if path.is_file() and path.suffix.lower() == ".json":
         return {"cameras/transforms.json": path}
     for folder in (path, path / "0", path / "sparse", path / "sparse" / "0"):
@@ -87,79 +91,61 @@ def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[Kn
         RequestError: the files are damaged, or hold no posed image.
     """
     files = list(files)
-    source = files[0].parent if files[0].suffix != ".json" else files[0]
+    is_list = files[0].suffix.lower() == ".json"
+    source = files[0] if is_list else files[0].parent
     try:
-        if files[0].suffix == ".json":
-            cameras, units = _read_transforms(files[0], setting)
-        else:
-            cameras, units = _read_colmap(files[0].parent), "arbitrary"
-    except RequestError:
-        raise
-    except Exception as error:
+        posed, units = read_transforms(source) if is_list else (_posed(source), "")
+    except UnusableFile as error:
         raise RequestError(
-            f"{setting}: {source} can't be read ({type(error).__name__}: {error}). Is it whole?"
+            f"{setting}: {source} {error}. Is it whole? Give the cameras as the program that "
+            "found them wrote them."
         ) from error
-    if not cameras:
+    if not posed:
         raise RequestError(f"{setting}: {source} holds no posed image.")
+    cameras = [KnownCamera(one.name, _lens(one.lens), one.cam_from_world) for one in posed]
+    units = "mm" if units == "mm" else "arbitrary"
     return sorted(cameras, key=lambda camera: camera.name), units
 
 
-def _read_colmap(folder: Path) -> list[KnownCamera]:
-    check_whole(folder)
-    model = quiet_pycolmap().Reconstruction(str(folder))
-    return [
-        KnownCamera(
-            image.name,
-            model.cameras[image.camera_id],
-            np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
-        )
-        for image in model.images.values()
-        if image.has_pose
-    ]
-
-
-def _read_transforms(path: Path, setting: str) -> tuple[list[KnownCamera], str]:
-    data = json.loads(path.read_text())
-    cameras = []
-    for number, frame in enumerate(data["frames"]):
-        said: Mapping[str, Any] = {**data, **frame}
-        pose = np.array(frame["transform_matrix"], np.float64)
-        if pose.shape not in ((3, 4), (4, 4)):
-            raise RequestError(
-                f"{setting}: frame {number} of {path} has a transform_matrix of shape "
-                f"{'x'.join(map(str, pose.shape))}, not 4x4."
+def _posed(folder: Path) -> list[PosedLens]:
+    """The posed images of a COLMAP model, as its own reader poses them."""
+    model = read_model(folder)
+    if model.has_points:
+        read_cloud(folder)  # a model that is half there is refused, whatever is wanted of it
+    rigid = {number: _rigid(image.cam_from_world) for number, image in model.images.items()}
+    for number, image in model.images.items() if model.frames else ():
+        frame, sensor_from_rig = model.frame_of(number)
+        framed = _rigid(frame.rig_from_world)
+        if sensor_from_rig is not None:
+            framed = _rigid(sensor_from_rig) * framed
+        apart = np.abs(framed.matrix() - rigid[number].matrix()).max()
+        if apart > _POSES_AGREE * max(1.0, np.abs(framed.translation).max()):
+            raise UnusableFile(
+                f"is damaged: its images and its frames say different poses of {image.name}"
             )
-        pose = np.vstack([pose[:3], [0, 0, 0, 1]])
-        cam_from_world = np.asarray(np.linalg.inv(pose @ OPENCV_FROM_OPENGL), np.float64)
-        cameras.append(
-            KnownCamera(str(frame["file_path"]), _lens(said, path, setting), cam_from_world)
-        )
-    return cameras, "mm" if data.get("units") == "mm" else "arbitrary"
+        rigid[number] = framed
+    found = []
+    for number, image in model.images.items():
+        pose = np.vstack([rigid[number].matrix(), [0, 0, 0, 1]])
+        check_pose(pose, f"image {number} ({image.name})", "the pose")
+        found.append(PosedLens(image.name, model.lenses[image.camera], pose))
+    return found
 
 
-def _lens(said: Mapping[str, Any], path: Path, setting: str) -> Any:
-    try:
-        width, height = int(said["w"]), int(said["h"])
-        if "fl_x" in said:
-            fx = float(said["fl_x"])
-        else:
-            fx = 0.5 * width / np.tan(0.5 * float(said["camera_angle_x"]))
-    except KeyError as error:
-        raise RequestError(
-            f"{setting}: {path} gives no {error} for {said.get('file_path', 'a frame')}. It "
-            "needs w, h and fl_x (or camera_angle_x), for all frames or for each."
-        ) from None
-    fisheye = "FISHEYE" in str(said.get("camera_model", ""))
-    distortion = [float(said.get(name, 0)) for name in
-                  (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2"))]  # fmt: skip
-    parameters = [
-        fx, float(said.get("fl_y", fx)), float(said.get("cx", width / 2)),
-        float(said.get("cy", height / 2)), *distortion,
-    ]  # fmt: skip
+def _rigid(pose: Pose) -> Any:
+    pycolmap = quiet_pycolmap()
+    w, x, y, z = pose.quat_wxyz
+    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+    if abs(np.linalg.norm(pose.quat_wxyz) - 1) > 1e-9:  # written with few digits
+        rotation.normalize()
+    return pycolmap.Rigid3d(rotation, np.array(pose.translation))
+
+
+def _lens(lens: Lens) -> Any:
+    """`pycolmap.Camera` of a lens that was checked."""
     return quiet_pycolmap().Camera(
-        model="OPENCV_FISHEYE" if fisheye else "OPENCV",
-        width=width, height=height, params=parameters,
-    )  # fmt: skip
+        model=lens.model, width=lens.width, height=lens.height, params=lens.parameters
+    )
 
 
 def matching_cameras(
@@ -259,7 +245,7 @@ def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[
     v, u = np.mgrid[: view.height, : view.width] + 0.5
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
     pixels = lens.img_from_cam(np.ascontiguousarray((rays @ turn).reshape(-1, 3)))
-    pixels = np.where(np.isfinite(pixels), pixels, -1e6)
+    pixels = np.clip(np.where(np.isfinite(pixels), pixels, -1e6), -1e6, 1e6)
     source = pixels @ working_from_lens[:2, :2].T + working_from_lens[:2, 2] - 0.5
     straight = resampled(view, source.reshape(view.height, view.width, 2))
     parameters = " ".join(f"{value:.9g}" for value in lens.params)

@@ -12,7 +12,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
-from pipeline.geometry.models.colmap import quiet_pycolmap
+from pipeline.errors import RequestError
+from pipeline.untrusted.files import UnusableFile
+from pipeline.untrusted.scenes.colmap import read_cloud, read_model
 
 Integers = npt.NDArray[np.int64]
 
@@ -47,21 +49,35 @@ def read_model_points(folder: Path) -> ModelPoints:
 
     Args:
         folder: of the model's files.
+
+    Raises:
+        RequestError: a file of them is missing or damaged.
     """
-    model = quiet_pycolmap().Reconstruction(str(folder))
-    identifiers = sorted(model.points3D)
-    seen: dict[str, set[int]] = {
-        image.name: set() for image in model.images.values() if image.has_pose
+    try:
+        model, cloud = read_model(folder), read_cloud(folder)
+    except UnusableFile as error:
+        raise RequestError(f"The model {folder} {error}. Is it whole?") from error
+    strangers = np.setdiff1d(cloud.images, np.array(list(model.images), np.uint32))
+    if len(strangers):
+        raise RequestError(
+            f"The model {folder} holds points that image {strangers[0]} observes, which is not in "
+            "its images. Is it whole?"
+        )
+    order = np.argsort(cloud.numbers)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    by_image = np.argsort(cloud.images, kind="stable")
+    points = np.repeat(rank, cloud.lengths)[by_image]
+    ends = np.searchsorted(cloud.images[by_image], list(model.images), side="right")
+    begins = np.searchsorted(cloud.images[by_image], list(model.images), side="left")
+    observed = {
+        image.name: np.unique(points[begin:end])
+        for image, begin, end in zip(model.images.values(), begins, ends, strict=True)
     }
-    for number, identifier in enumerate(identifiers):
-        for element in model.points3D[identifier].track.elements:
-            seen[model.images[element.image_id].name].add(number)
-    points = [model.points3D[identifier] for identifier in identifiers]
-    colors = np.array([point.color for point in points], np.float32).reshape(-1, 3)
     return ModelPoints(
-        positions=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        colors=colors / np.float32(255),
-        observed={name: np.array(sorted(seen[name]), np.int64) for name in sorted(seen)},
+        positions=cloud.positions[order],
+        colors=cloud.colors[order].astype(np.float32) / np.float32(255),
+        observed=dict(sorted(observed.items())),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,12 +11,12 @@ from typing import Any
 from pipeline.artifacts.metrics import Metrics
 from pipeline.config import load_config
 from pipeline.errors import PipelineError, RequestError, StageError
-from pipeline.files import read_json
 from pipeline.front.commands import run
 from pipeline.planning import PlannedStage
 from pipeline.runner import Reporter, Runner
 from pipeline.stage import get_stage
-from pipeline.store import Result
+from pipeline.store import Result, read_own
+from pipeline.store.places import remove
 from pipeline.studies.benchmark.results import FINISHED
 from pipeline.studies.benchmark.splits import Split, pictures_of, split_views
 from pipeline.studies.benchmark.suite import LoadedSuite, Method, Scene, TableSpec, flat_overrides
@@ -196,8 +195,8 @@ def finished_record(cell: Cell, out: Path) -> dict[str, Any] | None:
 
     A failure to reconstruct counts as well: the same input would fail again.
     """
-    record = read_json(record_path(cell, out))
-    if not isinstance(record, dict) or record.get("status") not in FINISHED:
+    record = read_own(record_path(cell, out))
+    if record is None or record.get("status") not in FINISHED:
         return None
     planned = plan_stages(cell, out)
     keys = {stage.name: stage.key for stage in planned if stage.key is not None}
@@ -225,7 +224,7 @@ def run_cell(cell: Cell, out: Path, threads: int, reporter: Reporter) -> dict[st
     workspace = out / cell.workspace
     # A stage that goes on from a checkpoint would be timed from there on only.
     for leftover in workspace.glob("*/*.partial"):
-        shutil.rmtree(leftover)
+        remove(leftover)
     record = _told(cell)
     try:
         summary = run(

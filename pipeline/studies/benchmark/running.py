@@ -11,15 +11,18 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from pipeline.config import parse_override
 from pipeline.errors import RequestError
-from pipeline.files import read_json, write_json
+from pipeline.files import write_json
 from pipeline.installed import module_command
 from pipeline.measure import usable_cores
+from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.stage import get_stage
-from pipeline.store import Store
+from pipeline.store import Store, read_own, write_sealed
+from pipeline.store.locks import lock_of
+from pipeline.store.places import remove, stage_folder
 from pipeline.studies.benchmark.cells import (
     Cell,
     finished_record,
@@ -46,6 +49,7 @@ def benchmark(
     data: str | Path | None = None,
     jobs: int = 1,
     overrides: Iterable[str] | Mapping[str, Any] = (),
+    share: Share | None = None,
     say: Say | None = None,
 ) -> dict[str, Any]:
     """Run scenes x methods x view counts x seeds and write the paper's tables of them.
@@ -61,6 +65,7 @@ def benchmark(
         data: folder where the scenes' paths begin, instead of the one that the suite names.
         jobs: workspaces at a time, a process each; the cores are divided between them.
         overrides: settings for all cells: ``{"fit.iterations": 9}`` or ``["fit.iterations=9"]``.
+        share: who else may read the folder; None: as it is already.
         say: hears a line per cell.
 
     Returns:
@@ -75,7 +80,8 @@ def benchmark(
     cells, tables = plan_cells(loaded, dict(pairs))
     folder = Path(out) if out is not None else Path("runs") / f"benchmark_{loaded.path.stem}"
     threads = max(1, usable_cores() // jobs)
-    with _only_one(folder.absolute()) as place:
+    places = {cell.workspace.partition("/")[0] for cell in cells}
+    with kept_for(share_for(folder, share)), _only_one(folder.absolute(), places) as place:
         records = _run_all(cells, place, jobs, threads, say or (lambda text: None))
         results = _results(loaded, cells, tables, records, machine(jobs, threads))
         write_json(place / "results.json", results)
@@ -93,11 +99,11 @@ def _write_report(results: dict[str, Any], out: Path, say: Say) -> None:
 
 
 @contextlib.contextmanager
-def _only_one(folder: Path) -> Iterator[Path]:
+def _only_one(folder: Path, places: Iterable[str]) -> Iterator[Path]:
     """Make the folder and keep other benchmarks out of it."""
-    Store(folder).create()
-    (folder / "cells").mkdir(exist_ok=True)
-    lock = FileLock(folder / ".lock")
+    Store(folder).create(more=places)
+    stage_folder(folder, "cells")
+    lock = lock_of(folder)
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -159,7 +165,7 @@ class _Processes:
     def run(self, cell: Cell, out: Path, threads: int) -> dict[str, Any] | None:
         """Run one cell in a process; None if the benchmark is being stopped."""
         path = record_path(cell, out)
-        path.unlink(missing_ok=True)
+        remove(path)
         with self.lock:
             if self._stopped:
                 return None
@@ -169,7 +175,10 @@ class _Processes:
             self._running.add(process)
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            job = {"cell": cell.to_dict(), "out": str(out), "threads": threads}
+            job = {
+                "cell": cell.to_dict(), "out": str(out), "threads": threads,
+                "share": share_for(out),
+            }  # fmt: skip
             process.stdin.write(json.dumps(job) + "\n")
             process.stdin.flush()
         status = process.wait()
@@ -179,8 +188,8 @@ class _Processes:
             self._running.discard(process)
             if self._stopped:
                 return None
-        record = read_json(path)
-        if isinstance(record, dict):
+        record = read_own(path)
+        if record is not None:
             return record
         how = f"signal {-status}" if status < 0 else f"exit status {status}"
         if status == -9:
@@ -188,7 +197,7 @@ class _Processes:
         record = unfinished_record(
             cell, f"The process of this cell ended without a result ({how})."
         )
-        write_json(path, record)
+        write_sealed(path, record)
         return record
 
     def stop(self) -> None:

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pipeline.config import DEFAULT_PRESET, read_yaml, validate
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import RequestError, nearest, shown
 from pipeline.installed import shipped_configs
 from pipeline.studies.benchmark.paper import ROWS
+from pipeline.untrusted.paths import user_path
 
 #: Names become names of folders and files.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)]
@@ -23,7 +24,7 @@ VIEW_COUNTS = {"views": (3, 6, 9, 12), "photos": (), "ablations": (6,)}
 
 
 class SuiteModel(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Scene(SuiteModel):
@@ -139,7 +140,7 @@ class LoadedSuite:
 
     def file(self, path: str) -> Path:
         """A path of a scene as an absolute one. It may hold the characters of a pattern."""
-        return Path(self.data, Path(path).expanduser())
+        return Path(self.data, user_path(path, f"the suite {self.path.name}"))
 
     def images(self, scene: Scene) -> list[Path]:
         """What a scene names as its photographs, absolute."""
@@ -147,7 +148,7 @@ class LoadedSuite:
 
     def preset(self, method: Method) -> str:
         """A preset's name, or its YAML file, looked for beside the suite."""
-        beside = self.path.parent / method.preset
+        beside = self.path.parent / user_path(method.preset, "the preset")
         is_file = beside.suffix in (".yaml", ".yml") and beside.is_file()
         return str(beside) if is_file else method.preset
 
@@ -185,13 +186,14 @@ def load_suite(suite: str | Path, data: str | Path | None = None) -> LoadedSuite
 
 def _find_suite(suite: str | Path) -> Path:
     known = suites()
-    path = Path(suite)
+    path = user_path(suite, "the suite")
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return path.resolve()
     if str(suite) in known:
         return known[str(suite)]
     raise RequestError(
-        f"There is no suite '{suite}'. The suites are {', '.join(known)}; or give a YAML file."
+        f"There is no suite {shown(str(suite))}. The suites are {', '.join(known)}; or "
+        f"give a YAML file."
         f"{nearest(path.stem, known)}"
     )
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import threading
 import time
@@ -16,8 +15,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from pipeline.files import write_json
 from pipeline.front.progress import LineReporter
+from pipeline.process.privacy import kept_for, private_from_now_on
+from pipeline.store import write_sealed
 from pipeline.studies.benchmark.cells import Cell, record_path, run_cell, unfinished_record
 
 
@@ -44,12 +44,13 @@ class CellReporter(LineReporter):
 
 def main() -> None:
     """Run the job that stands in the first line of standard input."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the benchmark decides about its cells
     job: dict[str, Any] = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cell, out = Cell.from_dict(job["cell"]), Path(job["out"])
+    private_from_now_on()
     try:
-        record = run_cell(cell, out, job["threads"], CellReporter(cell))
+        with kept_for(job["share"]):
+            record = run_cell(cell, out, job["threads"], CellReporter(cell))
     except Exception as error:  # outside of any stage; it must not leave a trace on the terminal
         where = traceback.extract_tb(error.__traceback__)[-1]
         record = unfinished_record(
@@ -57,7 +58,8 @@ def main() -> None:
             f"A fault of ours: {type(error).__name__}: {error} ({Path(where.filename).name}, line "
             f"{where.lineno}). Please report it.",
         )
-    write_json(record_path(cell, out), record)
+    with kept_for(job["share"]):
+        write_sealed(record_path(cell, out), record)
 
 
 def _end_with_parent() -> None:

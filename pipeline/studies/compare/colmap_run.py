@@ -8,7 +8,6 @@ runs what FOLDER/request.json asks for, on FOLDER/images, into FOLDER/database.d
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 import time
@@ -25,6 +24,8 @@ from pipeline.errors import RequestError
 from pipeline.files import canonical_json, content_hash, folder_listing, read_json, write_json
 from pipeline.geometry.models.colmap import quiet_pycolmap
 from pipeline.installed import module_command
+from pipeline.store import read_own, write_sealed
+from pipeline.store.places import remove
 
 #: COLMAP's options by step: what differs from its defaults.
 Options = Mapping[str, Mapping[str, Any]]
@@ -61,8 +62,8 @@ class Job:
             EXIF), for those images where it is.
         masked: there are masks in ``masks/``.
         seed: of COLMAP's random samples.
-        threads: for features and matching; verification and mapping take one, so that the result
-            doesn't depend on them.
+        threads: for matching; features (which are stored in the order in which they are found),
+            verification and mapping take one, so that the result doesn't depend on them.
     """
 
     options: Options = field(default_factory=dict)
@@ -94,20 +95,28 @@ def run_on_views(
         any(view.mask is not None for view in views), seed, threads,
     )  # fmt: skip
     fresh = folder.with_name(f"{folder.name}.new")
-    shutil.rmtree(fresh, ignore_errors=True)
+    remove(fresh)
     _write_images(fresh, views)
     key = _key(fresh, job, photo_names(views))
-    done = read_json(folder / "run.json")
-    if isinstance(done, dict) and done.get("key") == key:
-        shutil.rmtree(fresh)
+    done = read_own(folder / "run.json")
+    if done is not None and done["key"] == key and done["made"] == _made(folder):
+        remove(fresh)
         return done
     message(f"COLMAP ({folder.name.removeprefix('colmap_')}) on {len(views)} views")
     record = {"key": key, **run_job(fresh, job)}
     _rename(fresh / "sparse", photo_names(views))
-    write_json(fresh / "run.json", record)
-    shutil.rmtree(folder, ignore_errors=True)
+    record["made"] = _made(fresh)
+    write_sealed(fresh / "run.json", record)
+    remove(folder)
     fresh.rename(folder)
     return record
+
+
+def _made(folder: Path) -> str:
+    """Hash of all files but the one that says it, and those that reading a database makes."""
+    passing = ("run.json", "database.db-wal", "database.db-shm")
+    listing = folder_listing(folder)
+    return content_hash({name: entry for name, entry in listing.items() if name not in passing})
 
 
 def photo_names(views: Sequence[View]) -> dict[str, str]:
@@ -200,7 +209,7 @@ def reconstruct(folder: Path, job: Job) -> None:
 
     database = folder / "database.db"
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = job.threads
+    extraction.num_threads = 1
     reader = pycolmap.ImageReaderOptions()
     if job.masked:
         reader.mask_path = str(folder / "masks")

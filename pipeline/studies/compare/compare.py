@@ -11,11 +11,13 @@ from typing import Any
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from pipeline.files import read_json, write_atomic, write_json
+from pipeline.files import write_atomic, write_json
 from pipeline.measure import usable_cores
 from pipeline.pages.page import REPORT
+from pipeline.process.privacy import kept_for, share_for
 from pipeline.runner import Reporter
 from pipeline.store import CorruptResultError, Result, Store
+from pipeline.store.places import stage_folder
 from pipeline.studies.compare import clouds, evidence, poses
 from pipeline.studies.compare.colmap_run import SETTINGS, photo_names, run_on_views, thresholds
 from pipeline.studies.compare.fits import fit_rows
@@ -24,6 +26,7 @@ from pipeline.studies.compare.page import write_report
 from pipeline.studies.compare.tables import markdown, tables_of
 from pipeline.studies.report import run_report
 from pipeline.studies.report.compared import FILE, FOLDER
+from pipeline.workspace import read_request
 
 #: The stages whose cameras or points are compared where the workspace has them, in their order.
 STAGES = ("views", "init", "align", "swap", "sap", "flow", "fit")
@@ -96,8 +99,18 @@ def compare(
     Raises:
         RequestError: no such workspace or files, or nothing to compare with.
     """
-    home, reporter = Path(workspace), reporter or Reporter()
-    threads = threads or usable_cores()
+    home = Path(workspace)
+    with kept_for(share_for(home)):
+        return _compare(
+            home, colmap, run_colmap, ground_truth, mesh, fit, threads or usable_cores(),
+            reporter or Reporter(),
+        )  # fmt: skip
+
+
+def _compare(
+    home: Path, colmap: str | Path | None, run_colmap: bool, ground_truth: str | Path | None,
+    mesh: str | Path | None, fit: bool, threads: int, reporter: Reporter,
+) -> Comparison:  # fmt: skip
     store, prepared = _workspace(home)
     views = _loaded(store, prepared, "views").views
     _check(colmap, run_colmap, ground_truth, mesh)
@@ -107,8 +120,8 @@ def compare(
     if ground_truth is not None:
         truth, units = read_truth(Path(ground_truth), views)
     surface = clouds.read_surface(Path(mesh), list(truth.values())) if mesh else None
-    folder = home / FOLDER
-    folder.mkdir(exist_ok=True)
+    store.create()
+    folder = stage_folder(home, FOLDER)
 
     ours = _entries_of(store)
     rivals = [_given_entry(given, views)] if given else []
@@ -159,11 +172,7 @@ def compare(
 
 
 def _workspace(home: Path) -> tuple[Store, Result]:
-    if read_json(home / "request.json") is None:
-        raise RequestError(
-            f"{home} is not a workspace: no run has been started there. Give the folder that "
-            "'pipeline run' named, with -w."
-        )
+    read_request(home)
     store = Store(home)
     prepared = store.current("views")
     if prepared is None:

@@ -15,12 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.geometry.models.colmap import quiet_pycolmap
+from pipeline.untrusted.files import Kind, UnusableFile, opened
+from pipeline.untrusted.scenes.cameras import LENSES, Lens, check_lens
+from pipeline.untrusted.scenes.colmap import read_model
 
 Pair = tuple[str, str]
 #: COLMAP numbers a pair of images by id1 * this + id2.
 PAIR_BASE = 2147483647
 #: Pairs, those with most matches, whose relative pose is looked at.
 PAIRS_TRIED = 40
+#: A database with the descriptors of 10,000 photographs; the longest blob, of 10 million keypoints.
+DATABASE, _LONGEST_VALUE = Kind("a database of COLMAP's", 1 << 37), 1 << 28
+_TABLES = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
 
 
 @dataclass(frozen=True)
@@ -50,13 +56,27 @@ def database_beside(model: Path) -> Path | None:
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     """A copy of the database without its write-ahead files: the user's stays as it is."""
+    try:
+        with opened(path, DATABASE):
+            pass
+    except UnusableFile as error:
+        raise sqlite3.DatabaseError(f"it {error}") from error
     with tempfile.TemporaryDirectory() as scratch:
-        copy = Path(scratch) / "database.db"
-        source = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
-        target = sqlite3.connect(copy)
+        source = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+        target = sqlite3.connect(Path(scratch) / "database.db")
         try:
             source.backup(target)
+            target.text_factory = lambda text: text.decode(errors="replace")
+            # A schema is a program too: views and expressions of others are not run for long.
+            target.execute("PRAGMA trusted_schema = OFF")
+            target.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+            tables = {name for (name,) in target.execute(_TABLES)}
+            for name in ("images", "cameras", "keypoints", "two_view_geometries"):
+                if name not in tables:
+                    raise sqlite3.DatabaseError(f"it has no table {name}")
             yield target
+        except UnicodeDecodeError as error:  # also of SQLite's own message about the schema
+            raise sqlite3.DatabaseError("it holds names that are no text") from error
         finally:
             source.close()
             target.close()
@@ -66,37 +86,51 @@ def read_evidence(path: Path) -> Evidence:
     """Read a COLMAP database of any version (by SQL, since pycolmap would convert it in place).
 
     Raises:
-        sqlite3.Error: it is not one, or damaged.
+        sqlite3.Error: it is not one, or damaged; the message names the table.
     """
     with _opened(path) as database:
-        names = dict(database.execute("SELECT image_id, name FROM images"))
-        camera_of = dict(database.execute("SELECT image_id, camera_id FROM images"))
+        names: dict[int, str] = {}
+        camera_of: dict[int, int] = {}
+        for number, name, camera in _rows(database, "images", "image_id, name, camera_id"):
+            if not isinstance(name, str) or not isinstance(camera, int):
+                raise _damaged("images", number)
+            names[number], camera_of[number] = name, camera
         lenses = {
-            number: quiet_pycolmap().Camera(
-                camera_id=number,
-                model=quiet_pycolmap().CameraModelId(model),
-                width=width,
-                height=height,
-                params=np.frombuffer(parameters, np.float64).tolist(),
-            )
-            for number, model, width, height, parameters in database.execute(
-                "SELECT camera_id, model, width, height, params FROM cameras"
-            )
+            row[0]: _lens(*row)
+            for row in _rows(database, "cameras", "camera_id, model, width, height, params")
         }
-        keypoints = {
-            names[number]: _array(data, rows, columns, np.float32)[:, :2].astype(np.float64)
-            for number, rows, columns, data in database.execute(
-                "SELECT image_id, rows, cols, data FROM keypoints"
-            )
-        }
+        keypoints = {}
+        for number, rows, columns, data in _rows(
+            database, "keypoints", "image_id, rows, cols, data"
+        ):
+            found = _array("keypoints", number, data, rows, columns, np.float32)
+            if number not in names or found.shape[1] < 2 or not np.isfinite(found).all():
+                raise _damaged("keypoints", number)
+            keypoints[names[number]] = found[:, :2].astype(np.float64)
         inliers = {}
-        for pair, rows, columns, data in database.execute(
-            "SELECT pair_id, rows, cols, data FROM two_view_geometries ORDER BY pair_id"
+        for pair, rows, columns, data in _rows(
+            database, "two_view_geometries", "pair_id, rows, cols, data", "ORDER BY pair_id"
         ):
             second = pair % PAIR_BASE
             first = (pair - second) // PAIR_BASE
-            found = _array(data, rows, columns or 2, np.uint32).astype(np.int64)
-            inliers[names[first], names[second]] = found
+            if first not in names or second not in names:
+                raise _damaged("two_view_geometries", pair)
+            table = "two_view_geometries"
+            matched = _array(table, pair, data, rows, columns or 2, np.uint32).astype(np.int64)
+            counts = [len(keypoints.get(names[number], ())) for number in (first, second)]
+            if matched.shape[1] != 2 or (len(matched) and (matched.max(0) >= counts).any()):
+                raise sqlite3.DatabaseError(
+                    f"a match of {names[first]} and {names[second]} is of a keypoint that there "
+                    "isn't"
+                    if matched.shape[1] == 2
+                    else str(_damaged(table, pair))
+                )
+            inliers[names[first], names[second]] = matched
+        strangers = sorted(set(camera_of.values()) - set(lenses))
+        if strangers:
+            raise sqlite3.DatabaseError(
+                f"its images name the camera {strangers[0]}, which it lacks"
+            )
     return Evidence(
         keypoints=keypoints,
         inliers=inliers,
@@ -104,8 +138,48 @@ def read_evidence(path: Path) -> Evidence:
     )
 
 
-def _array(data: bytes | None, rows: int, columns: int, dtype: type) -> npt.NDArray[Any]:
-    return np.frombuffer(data or b"", dtype).reshape(rows, columns)
+def _rows(
+    database: sqlite3.Connection, table: str, columns: str, order: str = ""
+) -> Iterator[tuple[Any, ...]]:
+    """The rows of a table, whose first column is a whole number."""
+    for row in database.execute(f"SELECT {columns} FROM {table} {order}"):
+        if not isinstance(row[0], int) or row[0] < 0:
+            raise _damaged(table, row[0])
+        yield row
+
+
+def _lens(number: int, model: object, width: object, height: object, parameters: object) -> Any:
+    names = {lens: name for name, (lens, _) in LENSES.items()}
+    whole = isinstance(model, int) and isinstance(width, int) and isinstance(height, int)
+    if not whole or model not in names or not isinstance(parameters, bytes):
+        raise _damaged("cameras", number)
+    name = names[model]
+    if len(parameters) != 8 * len(LENSES[name][1]):
+        raise _damaged("cameras", number)
+    assert isinstance(width, int) and isinstance(height, int)
+    lens = Lens(name, width, height, tuple(np.frombuffer(parameters, np.float64).tolist()))
+    try:
+        check_lens(lens, f"camera {number}")
+    except UnusableFile as error:
+        raise sqlite3.DatabaseError(f"it {error}") from error
+    return quiet_pycolmap().Camera(
+        camera_id=number, model=name, width=width, height=height, params=lens.parameters
+    )
+
+
+def _array(
+    table: str, number: int, data: object, rows: object, columns: object, dtype: type
+) -> npt.NDArray[Any]:
+    data = b"" if data is None and rows == 0 else data
+    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(columns, int)):
+        raise _damaged(table, number)
+    if rows < 0 or columns < 0 or rows * columns * np.dtype(dtype).itemsize != len(data):
+        raise _damaged(table, number)
+    return np.frombuffer(data, dtype).reshape(rows, columns)
+
+
+def _damaged(table: str, number: object) -> sqlite3.DatabaseError:
+    return sqlite3.DatabaseError(f"entry {str(number)[:40]!r} of its table {table} is damaged")
 
 
 def pair_table(evidence: Evidence) -> list[dict[str, Any]]:
@@ -216,12 +290,7 @@ def why_left_out(
 
 def mapped_keypoints(model: Path) -> dict[str, npt.NDArray[np.bool_]]:
     """For each registered image of a model: which of its keypoints observe a point."""
-    read = quiet_pycolmap().Reconstruction(str(model))
-    return {
-        image.name: np.array([point.has_point3D() for point in image.points2D], bool)
-        for image in read.images.values()
-        if image.has_pose
-    }
+    return {image.name: image.has_point for image in read_model(model).images.values()}
 
 
 def renamed(evidence: Evidence, labels: Mapping[str, str]) -> Evidence:

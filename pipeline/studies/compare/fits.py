@@ -13,6 +13,7 @@ from pipeline.front.commands import run
 from pipeline.runner import Reporter
 from pipeline.stage import get_stage
 from pipeline.store import Result, Store
+from pipeline.workspace import read_request
 
 #: Stages of a run that a comparison repeats, in their order.
 REPEATED = ("views", "init", "align", "sap", "flow", "fit", "evaluate")
@@ -98,10 +99,9 @@ def _run(
     workspace: Path, folder: Path, changes: Mapping[str, Any], stages: list[str],
     reporter: Reporter | None,
 ) -> dict[str, Any]:  # fmt: skip
-    request = read_json(workspace / "request.json") or {}
     try:
         done = run(
-            request.get("images", []), workspace=folder, overrides=changes, stages=stages,
+            read_request(workspace)["images"], workspace=folder, overrides=changes, stages=stages,
             reporter=reporter,
         )  # fmt: skip
     except PipelineError as error:

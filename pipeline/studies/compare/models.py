@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,10 @@ from pipeline.geometry.models.known_cameras import (
     read_cameras,
 )
 from pipeline.geometry.models.model_points import ModelPoints, read_model_points
+from pipeline.untrusted.paths import user_path
+
+#: Folders of COLMAP's models; `isdigit` also takes digits that `int` doesn't.
+_NUMBER = re.compile(r"[0-9]{1,9}")
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,12 @@ class Model:
 
 def model_folders(path: Path) -> list[Path]:
     """The folders with a COLMAP model in them: `path` itself, or the numbered ones below it."""
-    path = path.expanduser()
+    path = user_path(path, "--colmap")
     for parent in (path, path / "sparse"):
         if _is_model(parent):
             return [parent]
         if parent.is_dir():
-            numbered = [entry for entry in parent.iterdir() if entry.name.isdigit()]
+            numbered = [entry for entry in parent.iterdir() if _NUMBER.fullmatch(entry.name)]
             found = [entry for entry in numbered if _is_model(entry)]
             if found:
                 return sorted(found, key=lambda entry: int(entry.name))

@@ -5,8 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 
-def run_report(workspace: str | Path) -> Path:
+def run_report(workspace: str | Path, *, anonymous: bool = False) -> Path:
     """Write ``WORKSPACE/report.html`` from what the workspace holds, and ``check.html`` beside it.
+
+    Args:
+        anonymous: write ``report_anonymous.html`` instead, to be passed on: without names of files,
+            folders, host and user, without dates, and without links to what is not in it. The
+            photographs themselves are in it.
 
     Returns:
         The file.
@@ -14,6 +19,8 @@ def run_report(workspace: str | Path) -> Path:
     Raises:
         RequestError: the folder is not a workspace, or can't be written to.
     """
+    from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.report.run import write_run_report
 
-    return write_run_report(Path(workspace))
+    with kept_for(share_for(Path(workspace))):
+        return write_run_report(Path(workspace), anonymous)

@@ -44,7 +44,7 @@ def compared_table(described: Mapping[str, Any]) -> Compared:
 
 def comparison(case: Case) -> dict[str, Any] | None:
     """The tables of the last comparison, and the stages that were computed anew since then."""
-    figures = read_json(case.workspace / FOLDER / FILE)
+    figures = case.hide(read_json(case.workspace / FOLDER / FILE))
     if not isinstance(figures, dict) or not figures.get("tables"):
         return None
     in_use = {record.name: record.result.key for record in case.stages if record.result}

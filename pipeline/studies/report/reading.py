@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.config import Config, load_config
-from pipeline.errors import PipelineError, RequestError
-from pipeline.files import read_json
+from pipeline.errors import PipelineError
 from pipeline.pages.case import Case, StageRecord
 from pipeline.store import Result, Store
-from pipeline.workspace import StageStatus, status
+from pipeline.workspace import StageStatus, read_request, status
 
 
 def read_case(workspace: Path) -> Case:
@@ -18,14 +17,12 @@ def read_case(workspace: Path) -> Case:
     Raises:
         RequestError: no run has been started there.
     """
-    request = read_json(workspace / "request.json")
-    if not isinstance(request, dict):
-        raise RequestError(
-            f"{workspace} is not a workspace: no run has been started there. Give the folder that "
-            "'pipeline run' named, with -w."
-        )
+    request = read_request(workspace)
     notes: list[str] = []
     store = Store(workspace)
+    for pointer in sorted(workspace.glob("*/current.json")):
+        store.current(pointer.parent.name)
+    notes += store.said
     try:
         config: Config | None = load_config(request.get("preset"), request.get("overrides", []))
     except PipelineError as error:

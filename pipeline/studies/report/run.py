@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import yaml
 
 from pipeline.errors import PipelineError
+from pipeline.pages.anonymous import anonymous as without_names
 from pipeline.pages.case import Case, title_of
-from pipeline.pages.page import CHECK, REPORT, seconds, write_page
+from pipeline.pages.page import ANONYMOUS, CHECK, REPORT, seconds, write_page
 from pipeline.pages.parts import Card, Fact, Hero, Link, Part, Section
 from pipeline.pages.pictures import Picture, from_file
 from pipeline.pages.tables import costs
@@ -30,10 +31,13 @@ Some = TypeVar("Some")
 MOST_NAMED, MOST_PICTURES = 4, 12
 
 
-def write_run_report(workspace: Path) -> Path:
+def write_run_report(workspace: Path, anonymous: bool = False) -> Path:
     """Write the report of a workspace's last request; see `pipeline.studies.report.run_report`."""
     case = read_case(workspace)
-    check = _drawn(case, "page to put the teeth right", write_check_page, False)
+    if anonymous:
+        case, check = without_names(case), None
+    else:
+        check = _drawn(case, "page to put the teeth right", write_check_page, None)
     # The last stage says most of what came out; the sections stand in the order of the run.
     told = [part_of_stage(case, record.name) for record in case.stages]
     first_last = [
@@ -41,24 +45,27 @@ def write_run_report(workspace: Path) -> Path:
         *(part for parts in told[::-1] for part in parts),
         *_parts(case, "findings", closing),
     ]
+    told, first_last = case.hide(told), case.hide(first_last)
     sections = [part for parts in told for part in parts if isinstance(part, Section)]
     sections = [section for section in sections if section.blocks]
     manifests = {record.name: record.manifest for record in case.stages}
     views = _drawn(case, "photographs", lambda case: case.latest("views"), None)
     return write_page(
-        "pipeline.studies.report", "run.html", workspace / REPORT,
-        title=workspace.resolve().name, case=case, failed=case.failed, notes=case.notes,
+        "pipeline.studies.report", "run.html", workspace / (ANONYMOUS if anonymous else REPORT),
+        title="A case" if anonymous else workspace.resolve().name, case=case,
+        failed=case.failed, notes=case.hide(case.notes),
         stale=[r for r in case.stages if r.state in ("stale", "pending") and r.result],
         total=len(views) if views else 0, warnings=list(case.warnings()), costs=costs(manifests),
         cards=_only(Card, first_last), facts=_only(Fact, first_last),
-        hero=next(iter(_only(Hero, first_last)), None), links=links(case, first_last),
+        hero=next(iter(_only(Hero, first_last)), None),
+        links=[] if anonymous else links(case, first_last),
         to_check=[section for section in sections if section.place == "check"],
         chapters=[section for section in sections if section.place == "chapter"],
         folded=[section for section in sections if section.place in ("folded", "open")],
         comparison_with_colmap=_drawn(case, "comparison", comparison, None),
-        failure_pictures=_drawn(case, "failure", failure_pictures, list[Picture]()),
+        failure_pictures=case.hide(_drawn(case, "failure", failure_pictures, list[Picture]())),
         settings=settings(case), versions=versions(case), command=command(case),
-        date=time.strftime("%Y-%m-%d %H:%M"), diagnosis=diagnosis(case),
+        date="" if anonymous else time.strftime("%Y-%m-%d %H:%M"), diagnosis=diagnosis(case),
         check=CHECK if check else "",
     )  # fmt: skip
 
@@ -181,7 +188,7 @@ def settings(case: Case) -> list[tuple[str, str]]:
             values = case.settings[record.name].model_dump(mode="json")
         if values is not None:
             found.append((record.name, _yaml(values)))
-    return found
+    return [(name, case.hide(text)) for name, text in found]
 
 
 def versions(case: Case) -> list[tuple[str, str]]:
@@ -208,7 +215,7 @@ def command(case: Case) -> str:
     if request.get("from"):
         parts.append(f"--from {request['from']}")
     parts += [f"--set {text}" for text in request.get("overrides", [])]
-    return " ".join(parts)
+    return str(case.hide(" ".join(parts)))
 
 
 def _yaml(values: Any) -> str:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from pipeline.errors import RequestError
 from pipeline.installed import is_installed, require
+from pipeline.untrusted.paths import user_path
 
 if TYPE_CHECKING:
     import torch
@@ -53,7 +54,7 @@ def find_vgg_weights(given: str | None) -> Path | None:
         RequestError: the given file does not exist, or what reads it is not installed.
     """
     if given is not None:
-        path = Path(given).expanduser()
+        path = user_path(given, "evaluate.lpips_weights")
         if not path.is_file():
             raise RequestError(
                 f"evaluate.lpips_weights: there is no file {path}. Give torchvision's weights of "
@@ -68,7 +69,7 @@ def find_vgg_weights(given: str | None) -> Path | None:
     cache = os.environ.get("TORCH_HOME") or (
         Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
     )
-    path = Path(cache).expanduser() / "hub" / "checkpoints" / VGG_FILE
+    path = user_path(cache, "TORCH_HOME or XDG_CACHE_HOME") / "hub" / "checkpoints" / VGG_FILE
     return path if path.is_file() else None
 
 

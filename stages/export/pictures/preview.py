@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from stages.export.surface import Mesh, vertex_normals
+from stages.export.mesh.surface import Mesh, vertex_normals
 
 Pixels = npt.NDArray[np.uint8]
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from stages.fit.config import FitSettings
     from stages.fit.trainer import Trainer
 
-#: up to so many views, a surface can be held
+#: up to so many views, a surface can be held: at four, holding cost .2 to 1.5 dB on two generated
+#: mouths and a scan, at five it gained .2 to .4 on the mouths
 FEW_VIEWS = 3
 #: what ``warp_slope: auto`` comes to, with a light beside the lens and without
 SLOPE_LIT, SLOPE = 2.0, 0.3

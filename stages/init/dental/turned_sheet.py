@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.kernels import kernel
+from stages.init.dental.surface.chart.raster import draw_triangle
 from stages.init.dental.surface.dense import ArchSurface
 
 Array32 = npt.NDArray[np.float32]
@@ -20,33 +21,19 @@ _OVERSAMPLING = 2
 
 @kernel(nogil=True)
 def _paint(pixels, depths, colours, faces, depth, image):  # type: ignore[no-untyped-def]
-    height, width = depth.shape
+    corners = np.zeros((3, 3))
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay = pixels[a, 0], pixels[a, 1]
-        bx, by = pixels[b, 0], pixels[b, 1]
-        cx, cy = pixels[c, 0], pixels[c, 1]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        # Counter-clockwise from outside is clockwise where y runs down; the rest is its far side.
-        if area > -1e-9:
-            continue
-        left = max(int(np.ceil(min(ax, bx, cx) - 0.5)), 0)
-        right = min(int(np.floor(max(ax, bx, cx) - 0.5)), width - 1)
-        top = max(int(np.ceil(min(ay, by, cy) - 0.5)), 0)
-        bottom = min(int(np.floor(max(ay, by, cy) - 0.5)), height - 1)
-        for y in range(top, bottom + 1):
-            for x in range(left, right + 1):
-                px, py = x + 0.5, y + 0.5
-                u = ((bx - px) * (cy - py) - (by - py) * (cx - px)) / area
-                v = ((cx - px) * (ay - py) - (cy - py) * (ax - px)) / area
-                w = 1.0 - u - v
-                if u < -1e-6 or v < -1e-6 or w < -1e-6:
-                    continue
-                z = u * depths[a] + v * depths[b] + w * depths[c]
-                if depth[y, x] == 0.0 or z < depth[y, x]:
-                    depth[y, x] = z
-                    for k in range(3):
-                        image[y, x, k] = u * colours[a, k] + v * colours[b, k] + w * colours[c, k]
+        for k in range(3):
+            corners[0, k], corners[1, k], corners[2, k] = (
+                colours[a, k],
+                colours[b, k],
+                colours[c, k],
+            )
+        draw_triangle(
+            pixels[a, 0], pixels[a, 1], depths[a], pixels[b, 0], pixels[b, 1], depths[b],
+            pixels[c, 0], pixels[c, 1], depths[c], corners, depth, image,
+        )  # fmt: skip
 
 
 def render_turned(

@@ -23,9 +23,9 @@ from stages.init.dental.cameras import kernels
 from stages.init.dental.cameras.held import (
     PER_SIMILARITY,
     HeldCameras,
-    minimise_held,
     nearest_similarity,
 )
+from stages.init.dental.cameras.minimise import minimise
 from stages.init.dental.template import is_lower_landmark
 
 Array = npt.NDArray[np.float64]
@@ -238,25 +238,23 @@ def adjust(
         )  # fmt: skip
         return rotations, centres, focals
 
-    seen_of = (
-        sightings.view, compact.astype(np.int64), sightings.pixels, sightings.deviations,
-        np.ascontiguousarray(template[seen]), is_lower_landmark()[seen], float(landmark_deviation),
-        nominal, angles, float(priors.distance), float(priors.distance_deviation), priors.focals,
-    )  # fmt: skip
-    if held is None:
-        reduced = np.empty((len(unknowns), len(unknowns)))
-        cost, log_determinant = kernels.minimise(
-            unknowns, seen_offsets, *seen_of, priors.focal_deviations,
-            matches.pairs, matches.starts, matches.pixels, matches.weights, matches.deviations,
-            max_steps, tolerance, reduced,
-        )  # fmt: skip
-    else:
+    turns, shifts = np.empty((views, 3, 3)), np.empty((views, 3))
+    similarity = np.eye(3), np.zeros(3), 0.0
+    size, focal_deviations = len(unknowns), priors.focal_deviations
+    if held is not None:
         turns, shifts = held.from_first()
-        reduced = np.empty((PER_SIMILARITY + kernels.PER_ARCH,) * 2)
-        cost, log_determinant = minimise_held(
-            unknowns, seen_offsets, *nearest_similarity(*place()[:2], turns, shifts), turns, shifts,
-            *seen_of, np.zeros(views), max_steps, tolerance, reduced,
-        )  # fmt: skip
+        similarity = nearest_similarity(*place()[:2], turns, shifts)
+        size, focal_deviations = PER_SIMILARITY + kernels.PER_ARCH, np.zeros(views)
+        matches = NO_MATCHES
+    reduced = np.empty((size, size))
+    cost, log_determinant = minimise(
+        unknowns, seen_offsets, sightings.view, compact.astype(np.int64), sightings.pixels,
+        sightings.deviations, np.ascontiguousarray(template[seen]), is_lower_landmark()[seen],
+        float(landmark_deviation), nominal, angles, float(priors.distance),
+        float(priors.distance_deviation), priors.focals, focal_deviations, matches.pairs,
+        matches.starts, matches.pixels, matches.weights, matches.deviations,
+        held is not None, *similarity, turns, shifts, max_steps, tolerance, reduced,
+    )  # fmt: skip
     offsets = np.zeros_like(offsets)
     offsets[seen] = seen_offsets
     rotations, centres, focals = place()

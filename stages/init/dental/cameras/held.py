@@ -14,20 +14,7 @@ import numpy.typing as npt
 
 from pipeline.geometry.rigid import nearest_rotation
 from pipeline.kernels import kernel
-from stages.init.dental.cameras.algebra import (
-    cholesky,
-    eliminate,
-    rotation_and_jacobian,
-    solve_cholesky,
-)
-from stages.init.dental.cameras.kernels import (
-    CENTRE_UNIT,
-    PER_ARCH,
-    PER_VIEW,
-    add_landmarks,
-    add_priors,
-    place_cameras,
-)
+from stages.init.dental.cameras.kernels import CENTRE_UNIT, PER_ARCH, PER_VIEW
 
 Array = npt.NDArray[np.float64]
 
@@ -129,7 +116,7 @@ def unknowns_of(  # type: ignore[no-untyped-def]
     " float64[:,::1])",
     nogil=True,
 )
-def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
+def tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
     """T [7V + 9, 16]: how the views' unknowns and the arch's follow similarity and arch."""
     T[:] = 0
     views = len(turns)
@@ -144,118 +131,3 @@ def _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type
             T[PER_VIEW * v + 3 + a, 6] = scale * shifts[v, a] / CENTRE_UNIT
     for k in range(PER_ARCH):
         T[PER_VIEW * views + k, PER_SIMILARITY + k] = 1
-
-
-@kernel(
-    "UniTuple(float64, 2)(float64[::1], float64[:,::1], float64[:,::1], float64[::1], float64,"
-    " float64[:,:,::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1], float64[:,::1],"
-    " float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1], float64, float64,"
-    " float64[::1], float64[::1], int64, float64, float64[:,::1])",
-    nogil=True,
-)
-def minimise_held(  # type: ignore[no-untyped-def]
-    x, offsets, rotation, centre, log_scale, turns, shifts, view_of, landmark_of, pixels,
-    deviations, template, lower, offset_deviation, nominal, angle_deviations, distance,
-    distance_deviation, focals, focal_deviations, max_steps, tolerance, S,
-):  # fmt: skip
-    """Levenberg-Marquardt from a similarity, the arch's part of x [7V + 9] and offsets [N, 3].
-
-    x and offsets are changed in place; the views' part of x follows the similarity.
-
-    Returns cost and log determinant of the Hessian at the end; S [16, 16] becomes the reduced
-    Hessian of similarity and arch.
-    """
-    views = len(turns)
-    n, m, count = len(x), PER_SIMILARITY + PER_ARCH, len(offsets)
-    arch = PER_VIEW * views
-    rotations, jacobians = np.empty((views, 3, 3)), np.empty((views, 3, 3))
-    centres, lens = np.empty((views, 3)), np.empty(views)
-    H, b = np.zeros((n, n)), np.zeros(n)
-    H_own, b_own = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    H_cross, own_inverse = np.zeros((count, n, 3)), np.empty((count, 3, 3))
-    crossed = np.empty((count, m, 3))
-    T = np.empty((n, m))
-    s, step, L = np.empty(m), np.empty(m), np.zeros((m, m))
-    small, small_jacobian, w = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    trial, trial_offsets = np.empty(n), np.empty((count, 3))
-    damping, cost, finished = 1e-3, 0.0, False
-    held_H, held_b = np.empty((m, m)), np.empty(m)
-    unknowns_of(rotation, centre, log_scale, turns, shifts, nominal, angle_deviations, distance, x)
-    for iteration in range(max_steps + 1):
-        H[:], b[:], H_own[:], b_own[:], H_cross[:] = 0, 0, 0, 0, 0
-        place_cameras(
-            x, views, nominal, angle_deviations, distance, focals, focal_deviations,
-            rotations, centres, lens, jacobians,
-        )  # fmt: skip
-        cost = add_priors(
-            x, offsets, views, distance, distance_deviation, centres, True, H, b, H_own, b_own
-        )
-        cost += add_landmarks(
-            x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
-            offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
-            focal_deviations, True, H, b, H_own, b_own, H_cross,
-        )  # fmt: skip
-        _tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
-        held_H[:] = T.T @ (H @ T)
-        held_b[:] = T.T @ b
-        for i in range(count):
-            crossed[i] = T.T @ H_cross[i]
-        if finished or iteration == max_steps:
-            break
-        improved = False
-        for _ in range(8):
-            eliminate(held_H, held_b, H_own, b_own, crossed, damping, S, s, own_inverse)
-            if np.isnan(cholesky(S, L)):
-                damping = max(damping, 1e-4) * 10
-                continue
-            solve_cholesky(L, s, step)
-            for i in range(count):
-                for a in range(3):
-                    change = 0.0
-                    for c in range(3):
-                        g = b_own[i, c]
-                        for k in range(m):
-                            g -= crossed[i, k, c] * step[k]
-                        change += own_inverse[i, a, c] * g
-                    trial_offsets[i, a] = offsets[i, a] - change
-            for a in range(3):
-                w[a] = -step[a]
-            rotation_and_jacobian(w, small, small_jacobian)
-            trial_rotation = small @ rotation
-            trial_centre = centre - CENTRE_UNIT * step[3:6]
-            trial_scale = log_scale - step[6]
-            for k in range(PER_ARCH):
-                trial[arch + k] = x[arch + k] - step[PER_SIMILARITY + k]
-            unknowns_of(
-                trial_rotation, trial_centre, trial_scale, turns, shifts, nominal,
-                angle_deviations, distance, trial,
-            )  # fmt: skip
-            place_cameras(
-                trial, views, nominal, angle_deviations, distance, focals, focal_deviations,
-                rotations, centres, lens, jacobians,
-            )  # fmt: skip
-            new_cost = add_priors(
-                trial, trial_offsets, views, distance, distance_deviation, centres, False,
-                H, b, H_own, b_own,
-            )  # fmt: skip
-            new_cost += add_landmarks(
-                trial, trial_offsets, views, view_of, landmark_of, pixels, deviations, template,
-                lower, offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
-                focal_deviations, False, H, b, H_own, b_own, H_cross,
-            )  # fmt: skip
-            if new_cost < cost:
-                improved = True
-                finished = cost - new_cost < tolerance
-                x[:] = trial
-                offsets[:] = trial_offsets
-                rotation[:] = trial_rotation
-                centre[:] = trial_centre
-                log_scale = trial_scale
-                damping = max(damping * 0.2, 1e-7)
-                break
-            damping = max(damping, 1e-5) * 8
-        if not improved:
-            finished = True
-    log_determinant = eliminate(held_H, held_b, H_own, b_own, crossed, 0.0, S, s, own_inverse)
-    log_determinant += cholesky(S, L)
-    return cost, log_determinant

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.kernels import kernel
-from stages.init.dental.cameras.algebra import (
-    cholesky,
-    cross_matrix,
-    eliminate,
-    rotation_and_jacobian,
-    solve_cholesky,
-)
+from stages.init.dental.cameras.algebra import cross_matrix, rotation_and_jacobian
 
 #: Unknowns per view, of the arch, and how strongly its parts vary (one standard deviation): stretch
 #: along each axis, shift of the lower jaw (mm), its extra stretch.
@@ -282,103 +276,3 @@ def add_priors(  # type: ignore[no-untyped-def]
                 b_own[i, a] += offsets[i, a]
                 H_own[i, a, a] += 1
     return cost
-
-
-@kernel(
-    "UniTuple(float64, 2)(float64[::1], float64[:,::1], int64[::1], int64[::1], float64[:,::1],"
-    " float64[:,::1], float64[:,::1], boolean[::1], float64, float64[:,:,::1], float64[:,::1],"
-    " float64, float64, float64[::1], float64[::1], int64[:,::1], int64[::1], float64[:,::1],"
-    " float64[::1], float64[::1], int64, float64, float64[:,::1])",
-    nogil=True,
-)
-def minimise(  # type: ignore[no-untyped-def]
-    x, offsets, view_of, landmark_of, pixels, deviations, template, lower, offset_deviation,
-    nominal, angle_deviations, distance, distance_deviation, focals, focal_deviations,
-    pairs, starts, matches, pair_weights, pair_deviations, max_steps, tolerance, S,
-):  # fmt: skip
-    """Levenberg-Marquardt from x [n], offsets [N, 3] (both changed in place).
-
-    Returns cost and log determinant of the Hessian at the end; S becomes the reduced Hessian.
-    """
-    views = len(nominal)
-    n, count = len(x), len(offsets)
-    rotations, jacobians = np.empty((views, 3, 3)), np.empty((views, 3, 3))
-    centres, lens = np.empty((views, 3)), np.empty(views)
-    H, b, s = np.zeros((n, n)), np.zeros(n), np.empty(n)
-    H_own, b_own = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    H_cross, own_inverse = np.zeros((count, n, 3)), np.empty((count, 3, 3))
-    L, step = np.zeros((n, n)), np.empty(n)
-    trial, trial_offsets = np.empty(n), np.empty((count, 3))
-    damping = 1e-3
-    cost = 0.0
-    finished = False
-    for iteration in range(max_steps + 1):
-        H[:], b[:], H_own[:], b_own[:], H_cross[:] = 0, 0, 0, 0, 0
-        place_cameras(
-            x, views, nominal, angle_deviations, distance, focals, focal_deviations,
-            rotations, centres, lens, jacobians,
-        )  # fmt: skip
-        cost = add_priors(
-            x, offsets, views, distance, distance_deviation, centres, True, H, b, H_own, b_own
-        )
-        cost += add_landmarks(
-            x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
-            offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
-            focal_deviations, True, H, b, H_own, b_own, H_cross,
-        )  # fmt: skip
-        cost += add_matches(
-            pairs, starts, matches, pair_weights, pair_deviations, rotations, centres, lens,
-            jacobians, angle_deviations, focal_deviations, True, H, b,
-        )  # fmt: skip
-        if finished or iteration == max_steps:
-            break
-        improved = False
-        for _ in range(8):
-            eliminate(H, b, H_own, b_own, H_cross, damping, S, s, own_inverse)
-            if np.isnan(cholesky(S, L)):
-                damping = max(damping, 1e-4) * 10
-                continue
-            solve_cholesky(L, s, step)
-            for k in range(n):
-                trial[k] = x[k] - step[k]
-            for i in range(count):
-                g0, g1, g2 = b_own[i, 0], b_own[i, 1], b_own[i, 2]
-                for k in range(n):
-                    cross = H_cross[i, k]
-                    g0 -= cross[0] * step[k]
-                    g1 -= cross[1] * step[k]
-                    g2 -= cross[2] * step[k]
-                for a in range(3):
-                    inverse = own_inverse[i, a]
-                    change = inverse[0] * g0 + inverse[1] * g1 + inverse[2] * g2
-                    trial_offsets[i, a] = offsets[i, a] - change
-            place_cameras(
-                trial, views, nominal, angle_deviations, distance, focals, focal_deviations,
-                rotations, centres, lens, jacobians,
-            )  # fmt: skip
-            new_cost = add_priors(
-                trial, trial_offsets, views, distance, distance_deviation, centres, False,
-                H, b, H_own, b_own,
-            )  # fmt: skip
-            new_cost += add_landmarks(
-                trial, trial_offsets, views, view_of, landmark_of, pixels, deviations, template,
-                lower, offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
-                focal_deviations, False, H, b, H_own, b_own, H_cross,
-            )  # fmt: skip
-            new_cost += add_matches(
-                pairs, starts, matches, pair_weights, pair_deviations, rotations, centres, lens,
-                jacobians, angle_deviations, focal_deviations, False, H, b,
-            )  # fmt: skip
-            if new_cost < cost:
-                improved = True
-                finished = cost - new_cost < tolerance
-                x[:] = trial
-                offsets[:] = trial_offsets
-                damping = max(damping * 0.2, 1e-7)
-                break
-            damping = max(damping, 1e-5) * 8
-        if not improved:
-            finished = True
-    log_determinant = eliminate(H, b, H_own, b_own, H_cross, 0.0, S, s, own_inverse)
-    log_determinant += cholesky(S, L)
-    return cost, log_determinant

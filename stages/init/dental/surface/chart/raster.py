@@ -5,18 +5,25 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.kernels import kernel
+from pipeline.kernels import helper, kernel
 from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
-@kernel(nogil=True)
-def _triangle(ax, ay, az, bx, by, bz, cx, cy, cz, corners, depth, place):  # type: ignore[no-untyped-def]
+@helper
+def draw_triangle(ax, ay, az, bx, by, bz, cx, cy, cz, corners, depth, values):  # type: ignore[no-untyped-def]
+    """Draw a triangle into a z-buffer, for kernels.
+
+    Args:
+        ax, ay, az, ...: float64, pixel and z-depth of each corner, counter-clockwise as seen.
+        corners: [3, K] float64 values at the corners; linear in the image between them.
+        depth: [H, W] z-depth so far, 0: nothing; changed in place.
+        values: [H, W, K] of what is nearest; changed in place.
+    """
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    # Clockwise in the image, where y runs down, is counter-clockwise from outside; the rest is seen
-    # from behind.
+    # Counter-clockwise is negative where y runs down; the rest is seen from behind.
     if area > -1e-9:
         return
     height, width = depth.shape
@@ -36,14 +43,14 @@ def _triangle(ax, ay, az, bx, by, bz, cx, cy, cz, corners, depth, place):  # typ
             z = 1.0 / (u / az + v / bz + w / cz)
             if depth[y, x] == 0.0 or z < depth[y, x]:
                 depth[y, x] = z
-                place[y, x, 0] = u * corners[0] + v * corners[2] + w * corners[4]
-                place[y, x, 1] = u * corners[1] + v * corners[3] + w * corners[5]
+                for k in range(values.shape[2]):
+                    values[y, x, k] = u * corners[0, k] + v * corners[1, k] + w * corners[2, k]
 
 
 @kernel(nogil=True)
 def _raster(pixels, depths, used, depth, place):  # type: ignore[no-untyped-def]
     rows, cols = used.shape
-    corners = np.zeros(6)
+    corners = np.zeros((3, 2))
     for i in range(rows - 1):
         for j in range(cols - 1):
             for half in range(2):
@@ -54,10 +61,10 @@ def _raster(pixels, depths, used, depth, place):  # type: ignore[no-untyped-def]
                     continue
                 if min(depths[i0, j0], depths[i1, j1], depths[i2, j2]) <= 1.0:
                     continue
-                corners[0], corners[1] = j0, i0
-                corners[2], corners[3] = j1, i1
-                corners[4], corners[5] = j2, i2
-                _triangle(
+                corners[0, 0], corners[0, 1] = j0, i0
+                corners[1, 0], corners[1, 1] = j1, i1
+                corners[2, 0], corners[2, 1] = j2, i2
+                draw_triangle(
                     np.float64(pixels[i0, j0, 0]), np.float64(pixels[i0, j0, 1]),
                     np.float64(depths[i0, j0]),
                     np.float64(pixels[i1, j1, 0]), np.float64(pixels[i1, j1, 1]),

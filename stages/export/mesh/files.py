@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from stages.export.surface import Mesh, face_normals, vertex_normals
+from stages.export.mesh.surface import Mesh, face_normals, vertex_normals
 
 
 def write_mesh_ply(path: Path, mesh: Mesh) -> None:

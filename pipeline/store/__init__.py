@@ -1,0 +1,25 @@
+"""The artifact store: what is computed once stays, whole and unchanged, until nobody needs it."""
+
+from pipeline.store.faults import file_in_the_way, is_disk_full
+from pipeline.store.records import read_own, write_sealed
+from pipeline.store.store import (
+    KEY_LENGTH,
+    MANIFEST,
+    CorruptResultError,
+    Result,
+    Store,
+    partial_name,
+)
+
+__all__ = [
+    "KEY_LENGTH",
+    "MANIFEST",
+    "CorruptResultError",
+    "Result",
+    "Store",
+    "file_in_the_way",
+    "is_disk_full",
+    "partial_name",
+    "read_own",
+    "write_sealed",
+]

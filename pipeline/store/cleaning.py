@@ -1,0 +1,78 @@
+"""What of a workspace can go: results that are not in use, and what killed runs left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+
+from filelock import Timeout
+
+from pipeline.store.locks import LOCK, lock_of
+from pipeline.store.places import ASIDE, is_folder, is_there, remove, size_of
+
+#: Ends the name of the folder that a result is written into.
+PARTIAL = ".partial"
+
+
+def clean(
+    root: Path, keep: int, in_use: Callable[[str], str], spare: Collection[str], manifest: str
+) -> tuple[list[str], int]:
+    """Delete what is not in use from the folders of a workspace that nobody is working in.
+
+    Args:
+        keep: so many of the newest other results of each stage stay.
+        in_use: stage -> name of the folder of the result in use.
+        spare: names (``stage/folder``) of what stays besides.
+        manifest: name of the file that makes a folder a result.
+
+    Returns:
+        Names of what was deleted, and the bytes freed.
+    """
+    removed: list[str] = []
+    freed = 0
+    for folder in stage_folders(root):
+        try:
+            with lock_of(folder).acquire(timeout=0):
+                for victim in _unused(folder, keep, in_use(folder.name), manifest):
+                    name = f"{folder.name}/{victim.name}"
+                    if name not in spare:
+                        freed += size_of(victim)
+                        removed.append(name)
+                        remove(victim)
+        except Timeout:
+            continue
+    return removed, freed
+
+
+def stage_folders(root: Path) -> Iterator[Path]:
+    """The folders of a workspace in which stages have worked."""
+    for folder in sorted(root.iterdir()):
+        if is_folder(folder) and is_there(folder / LOCK):
+            yield folder
+
+
+def checkpoints(root: Path) -> dict[str, int]:
+    """Name (``stage/folder``) -> bytes of what stopped runs left to go on from."""
+    return {
+        f"{folder.name}/{partial.name}": size_of(partial)
+        for folder in stage_folders(root)
+        for partial in sorted(folder.glob(f"*{PARTIAL}"))
+        if holds_checkpoint(partial)
+    }
+
+
+def holds_checkpoint(partial: Path) -> bool:
+    """Is there something to go on from in the folder of a stopped run?"""
+    scratch = partial / "scratch"
+    return is_folder(scratch) and any(scratch.iterdir())
+
+
+def _unused(folder: Path, keep: int, in_use: str, manifest: str) -> list[Path]:
+    entries = [path for path in folder.iterdir() if is_folder(path) or ASIDE in path.name]
+    whole = [path for path in entries if (path / manifest).is_file() and "." not in path.name]
+    others = sorted(
+        (path for path in whole if path.name != in_use),
+        key=lambda path: ((path / manifest).stat().st_mtime_ns, path.name),
+        reverse=True,
+    )
+    return [path for path in entries if path not in whole] + others[keep:]

@@ -1,0 +1,1 @@
+"""Scenes that others made: cameras, COLMAP's models, clouds of points, meshes."""

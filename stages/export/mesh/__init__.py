@@ -1,0 +1,1 @@
+"""The scene as a triangle mesh: fused from what cameras see of it, repaired, written."""

@@ -1,0 +1,122 @@
+"""What leaves the workspace says of nobody whose teeth it shows, when, and on what computer."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import getpass
+import re
+import socket
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import pytest
+from PIL import Image
+
+from pipeline.runner import RunSummary
+from pipeline.studies.report import run_report
+from tests.personal_data import PERSONAL
+
+#: Runs of base64 that are long enough to hold a picture or a name.
+BASE64 = re.compile(rb"[A-Za-z0-9+/]{40,}={0,2}")
+
+
+def layers(data: bytes, depth: int = 3) -> Iterator[bytes]:
+    """Bytes, and what is packed inside them: base64, deflate, at any of a few depths."""
+    yield data
+    if depth == 0:
+        return
+    for found in BASE64.findall(data):
+        try:
+            yield from layers(base64.b64decode(found + b"=" * (-len(found) % 4)), depth - 1)
+        except binascii.Error:
+            continue
+    for start, window in ((b"\x1f\x8b\x08", 31), (b"\x78\x9c", 15), (b"\x78\xda", 15)):
+        at = data.find(start)
+        while at >= 0:
+            with contextlib.suppress(zlib.error):
+                yield from layers(zlib.decompressobj(window).decompress(data[at:]), depth - 1)
+            at = data.find(start, at + 1)
+
+
+def spellings(text: str) -> set[bytes]:
+    """A text as files may hold it."""
+    return {form.encode(code) for form in (text, text.lower()) for code in ("utf-8", "utf-16-le")}
+
+
+def told(path: Path, secrets: tuple[str, ...]) -> list[str]:
+    """Those of the secrets that a file holds, whatever they are packed in."""
+    wanted = {secret: spellings(secret) for secret in secrets}
+    found = set()
+    for layer in layers(path.read_bytes()):
+        found |= {secret for secret, forms in wanted.items() if any(f in layer for f in forms)}
+    return sorted(found)
+
+
+def of_this_computer(run: RunSummary) -> tuple[str, ...]:
+    """Names of host, user, folders and today that nobody else has to know."""
+    today = (time.strftime("%Y-%m-%d"), time.strftime("%Y:%m:%d"), time.strftime("%Y%m%d"))
+    parts = [socket.gethostname(), str(run.workspace), str(Path.home()), *today]
+    if len(getpass.getuser()) > 4:  # a short one is a word of something else
+        parts.append(getpass.getuser())
+    return tuple(part for part in parts if len(part) > 4)
+
+
+def test_the_search_finds_what_is_packed(tmp_path: Path) -> None:
+    inner = zlib.compress(b"of one called Prognath, so it is")
+    page = b"<img src='data:x;base64," + base64.b64encode(b"\0" * 40 + inner) + b"'>"
+    (tmp_path / "page").write_bytes(page)
+    assert told(tmp_path / "page", PERSONAL) == ["Prognath"]
+
+
+def test_results_tell_of_nobody(sample_run: RunSummary) -> None:
+    assert sample_run.results is not None
+    secrets = (*PERSONAL, *of_this_computer(sample_run))
+    files = [path for path in sample_run.results.rglob("*") if path.is_file()]
+    assert len(files) > 8
+    assert {str(path): told(path, secrets) for path in files if told(path, secrets)} == {}
+    with av.open(str(sample_run.results / "orbit.mp4")) as film:
+        assert "creation_time" not in {**film.metadata, **film.streams.video[0].metadata}
+    for picture in sample_run.results.rglob("*.png"):
+        with Image.open(picture) as opened:
+            assert not opened.getexif()
+            assert not {"date", "comment", "author"} & {str(key).lower() for key in opened.info}
+
+
+def test_the_workspace_keeps_names_of_files_and_nothing_else_of_them(
+    sample_run: RunSummary,
+) -> None:
+    secrets = tuple(secret for secret in PERSONAL if secret != "Prognath")
+    files = [path for path in sample_run.workspace.rglob("*") if path.is_file()]
+    assert {str(path): told(path, secrets) for path in files if told(path, secrets)} == {}
+
+
+def test_a_report_without_names(sample_run: RunSummary) -> None:
+    open_page = run_report(sample_run.workspace)
+    assert told(open_page, ("Prognath",)), "the usual report names the photographs"
+    page = run_report(sample_run.workspace, anonymous=True)
+    assert page.name == "report_anonymous.html"
+    assert told(page, (*PERSONAL, *of_this_computer(sample_run), "sample_run")) == []
+    text = page.read_text()
+    assert not re.search(r'<a href="(?!#)', text), "what it leads to is not passed on"
+    assert "photographs placed in space" in text and "Time and memory" in text
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("The photograph Prognath_Anna_left.jpg is blurred.", "The photograph 002 is blurred."),
+        ("Pictures: /srv/patients/Anna/w/init/failure.", "Pictures: [path]"),
+        ("on the right and 3/4 of it, see a/b", "on the right and 3/4 of it, see a/b"),
+        ({"given": ["C:\\cases\\Prognath\\x.json", 3]}, {"given": ["[path]", 3]}),
+    ],
+)
+def test_texts_without_names(said: object, shown: object) -> None:
+    from pipeline.pages.anonymous import Secrets
+
+    places = {"Prognath_Anna_left.jpg": "002", "Prognath_Anna_left": "002", "Prognath": "[name]"}
+    assert Secrets(places).hide(said) == shown
