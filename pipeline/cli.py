@@ -14,6 +14,7 @@ import typer
 from pipeline.errors import PipelineError, RequestError, nearest
 from pipeline.process import signals
 from pipeline.process.privacy import SHARES, Share, private_from_now_on
+from pipeline.untrusted.names import let_streams_show_all
 
 EXAMPLES = """\
 dentalsplat turns a few photographs of teeth into a 3D scene that you can turn around and look at.
@@ -413,6 +414,7 @@ def main() -> NoReturn:
 
 def command_line() -> int:
     """Run the command line; every outcome has its exit status (docs/architecture.md)."""
+    let_streams_show_all()
     debug = "--debug" in sys.argv
     try:
         status = app(standalone_mode=False)

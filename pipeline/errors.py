@@ -9,11 +9,16 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from pipeline.untrusted.names import readable
+
 
 class PipelineError(Exception):
     """A failure that is explained to the user in one paragraph, never with a traceback."""
 
     exit_status = 1
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(readable(message))
 
 
 class RequestError(PipelineError):

@@ -10,12 +10,15 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from pipeline.untrusted.names import storable
+
 
 def canonical_json(value: Any) -> str:
     """JSON with one spelling per value: sorted keys, no spaces, no NaN."""
-    return json.dumps(
+    text = json.dumps(
         value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False
     )
+    return storable(text)
 
 
 def sha256_text(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -11,9 +12,10 @@ from typing import Any
 from pipeline import installed
 from pipeline.config import Config, result_fields
 from pipeline.errors import RequestError, nearest
-from pipeline.files import canonical_json, sha256_file, sha256_text
+from pipeline.files import canonical_json, sha256_text
 from pipeline.stage import Stage, get_stage, usable_stages
 from pipeline.store import Result, Store
+from pipeline.untrusted.files import ANY, UnusableFile, opened
 
 
 @dataclass(frozen=True)
@@ -281,16 +283,16 @@ def _hash_source(label: str, path: Path) -> str:
     try:
         stat = path.stat()
         return _hash_once(path, stat.st_size, stat.st_mtime_ns)
-    except OSError as error:
-        raise RequestError(
-            f"{label} can't be read ({error.strerror}). Mend or remove it."
-        ) from error
+    except (OSError, UnusableFile) as error:
+        why = f"can't be read ({error.strerror})" if isinstance(error, OSError) else str(error)
+        raise RequestError(f"{label} {why}. Mend or remove it.") from error
 
 
 @cache
 def _hash_once(path: Path, size: int, mtime_ns: int) -> str:
     """A video is looked at several times in one process, but read once."""
-    return sha256_file(path)
+    with opened(path, ANY) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def explain(

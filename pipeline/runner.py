@@ -26,6 +26,7 @@ from pipeline.planning import (
 from pipeline.process import signals
 from pipeline.stage import StageContext, get_stage, usable_stages
 from pipeline.store import CorruptResultError, Result, Store, file_in_the_way, is_disk_full
+from pipeline.untrusted.names import readable
 from pipeline.workspace import Request
 
 Figure = float | int | str
@@ -145,6 +146,7 @@ class RunContext(StageContext):
         self._reporter.progress(self._planned.name, step, done, total, **figures)
 
     def warn(self, message: str) -> None:
+        message = readable(message)
         self.warnings.append(message)
         self._reporter.message(f"{self._planned.name}: {message}")
 

@@ -14,6 +14,7 @@ from pipeline.planning import plan_chain, resolve_chain
 from pipeline.store import Store, partial_name
 from pipeline.store.places import is_folder, is_there, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
+from pipeline.untrusted.names import printable
 
 REQUEST = "request.json"
 
@@ -138,11 +139,11 @@ def default_workspace(images: Sequence[str | Path]) -> Path:
     if single and first.is_dir():
         folder = first.resolve()
     elif single and not any(c in first.name for c in "*?["):
-        return Path("runs") / first.stem
+        return Path("runs") / printable(first.stem)
     else:
         folder = first.resolve().parent
     name = folder.parent.name if folder.name.lower() in GENERIC_FOLDERS else folder.name
-    return Path("runs") / (name or "case")
+    return Path("runs") / (printable(name) or "case")
 
 
 @dataclass

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -48,8 +48,7 @@ class Flow(Artifact):
             stem = f"{pair.name_i}_{pair.name_j}"
             for way in ("forward", "backward"):
                 field = np.ascontiguousarray(getattr(pair, way), np.float32)
-                if not cv2.writeOpticalFlow(str(folder / f"{stem}_{way}.flo"), field):
-                    raise OSError(f"cannot write the flow of {stem} into {folder}")
+                write_flo(folder / f"{stem}_{way}.flo", field)
                 mask = np.where(getattr(pair, f"mask_{way}"), np.uint8(255), np.uint8(0))
                 write_png(folder / f"{stem}_{way}_mask.png", mask)
 
@@ -60,11 +59,28 @@ class Flow(Artifact):
             stem = path.name.removesuffix("_forward.flo")
             name_i, name_j = stem.split("_", 1)
             forward, backward = (
-                np.asarray(cv2.readOpticalFlow(str(folder / f"{stem}_{way}.flo")), np.float32)
-                for way in ("forward", "backward")
+                read_flo(folder / f"{stem}_{way}.flo") for way in ("forward", "backward")
             )
             mask_forward, mask_backward = (
                 read_png(folder / f"{stem}_{way}_mask.png") > 127 for way in ("forward", "backward")
             )
             pairs.append(FlowPair(name_i, name_j, forward, backward, mask_forward, mask_backward))
         return cls(tuple(pairs))
+
+
+def write_flo(path: Path, field: npt.NDArray[np.float32]) -> None:
+    """Write a flow [H, W, 2] as Middlebury's ``.flo``; OpenCV crashes on names that are no text."""
+    height, width = field.shape[:2]
+    path.write_bytes(_FLO + struct.pack("<ii", width, height) + field.astype("<f4").tobytes())
+
+
+def read_flo(path: Path) -> npt.NDArray[np.float32]:
+    """Read a flow [H, W, 2] as `write_flo` writes it."""
+    data = path.read_bytes()
+    width, height = struct.unpack_from("<ii", data, 4)
+    if data[:4] != _FLO or len(data) != 12 + 8 * width * height:
+        raise ValueError(f"{path} is not a readable .flo file")
+    return np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2).astype(np.float32)
+
+
+_FLO = struct.pack("<f", 202021.25)

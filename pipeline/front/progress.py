@@ -100,23 +100,31 @@ class LiveReporter(Reporter):
         self._display.start()
 
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
+        from rich.markup import escape
+
         text = "goes on from its checkpoint" if resumed else "; ".join(reasons)
-        self._task = self._display.add_task(text, total=None, stage=stage)
+        self._task = self._display.add_task(escape(text), total=None, stage=stage)
 
     def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
+        from rich.markup import escape
+
         left = self._pace.time_left(stage, step, done, total, time.monotonic())
         more = [describe(figures), left]
         text = step + "".join(f" · {part}" for part in more if part)
-        self._display.update(self._task, completed=done, total=total, description=text)
+        self._display.update(self._task, completed=done, total=total, description=escape(text))
 
     def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
+        from rich.markup import escape
+
         if self._task is not None:
             self._display.remove_task(self._task)
             self._task = None
         if cached:
             self._console.print(f"[bold]{stage:>9}[/] [dim]cached[/]")
         else:
-            text = f"{figures['wall_seconds']:6.1f} s  [dim]{describe(figures['summary'])}[/]"
+            text = (
+                f"{figures['wall_seconds']:6.1f} s  [dim]{escape(describe(figures['summary']))}[/]"
+            )
             self._console.print(f"[bold]{stage:>9}[/] {text}")
 
     def message(self, text: str) -> None:

@@ -43,7 +43,7 @@ def print_summary(summary: RunSummary) -> None:
             stage.action,
             f"{stage.figures['wall_seconds']:.1f}",
             f"{stage.figures['peak_memory_mb']:.0f}",
-            describe(stage.figures["summary"]),
+            escape(describe(stage.figures["summary"])),
         )
     console.print(table)
     for stage in summary.stages:
@@ -52,20 +52,22 @@ def print_summary(summary: RunSummary) -> None:
             console.print(warning, markup=False)
         pictures = stage.folder / "pictures" if stage.folder else None
         if pictures and pictures.is_dir():
-            console.print(f"Pictures ({stage.name}): {pictures}/", soft_wrap=True)
+            console.print(f"Pictures ({stage.name}): {pictures}/", soft_wrap=True, markup=False)
     if text := headline(summary):
         console.print(f"\n{text}")
     if summary.results:
-        console.print(f"\nResults: {summary.results}/", soft_wrap=True)
+        console.print(f"\nResults: {summary.results}/", soft_wrap=True, markup=False)
         viewer = summary.results / "viewer.html"
         if viewer.exists():
-            console.print(f"Look at it: open {viewer} in a browser.", soft_wrap=True)
+            console.print(f"Look at it: open {viewer} in a browser.", soft_wrap=True, markup=False)
     else:
-        console.print(f"\nResults: {summary.stages[-1].folder}/", soft_wrap=True)
+        console.print(f"\nResults: {summary.stages[-1].folder}/", soft_wrap=True, markup=False)
     if summary.check:
-        console.print(f"The teeth, to check and put right: {summary.check}", soft_wrap=True)
+        console.print(
+            f"The teeth, to check and put right: {summary.check}", soft_wrap=True, markup=False
+        )
     if summary.report:
-        console.print(f"How it went, with pictures: {summary.report}", soft_wrap=True)
+        console.print(f"How it went, with pictures: {summary.report}", soft_wrap=True, markup=False)
 
 
 #: Figures that everybody asks for, by the names under which stages report them.
@@ -93,7 +95,7 @@ def print_dry_run(summary: RunSummary) -> None:
     """What a run would do."""
     table = _table("stage", "", "why")
     for stage in summary.stages:
-        table.add_row(stage.name, stage.action, "; ".join(stage.reasons))
+        table.add_row(stage.name, stage.action, escape("; ".join(stage.reasons)))
     _console().print(table)
 
 
@@ -108,7 +110,7 @@ def print_status(stages: list[StageStatus]) -> None:
             why += "; goes on from its checkpoint"
         style = STATE_STYLE.get(stage.state, "")
         state = f"[{style}]{stage.state}[/]" if style else stage.state
-        table.add_row(stage.name, state, why, describe(stage.summary))
+        table.add_row(stage.name, state, escape(why), escape(describe(stage.summary)))
     _console().print(table)
 
 
@@ -117,7 +119,7 @@ def print_stages(stages: list[dict[str, Any]]) -> None:
     table = _table("stage", "what it does", "requires", "can use", "provides")
     for stage in stages:
         if "error" in stage:
-            table.add_row(stage["name"], f"[red]{stage['error']}[/]")
+            table.add_row(stage["name"], f"[red]{escape(stage['error'])}[/]")
             continue
         kinds = [", ".join(stage[key]) for key in ("requires", "optional", "provides")]
         if stage["may_provide"]:
@@ -143,5 +145,6 @@ def print_findings(findings: list[Finding]) -> None:
     table = _table("", "check", "found", "what to do")
     for finding in findings:
         style = STATE_STYLE.get(finding.level, "green" if finding.level == "ok" else "yellow")
-        table.add_row(f"[{style}]{finding.level}[/]", finding.name, finding.detail, finding.mend)
+        cells = map(escape, (finding.name, finding.detail, finding.mend))
+        table.add_row(f"[{style}]{finding.level}[/]", *cells)
     _console().print(table)

@@ -7,8 +7,8 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 
 class UnusableFile(Exception):  # noqa: N818
@@ -42,6 +42,8 @@ CAMERA_LIST = Kind("a list of cameras", 1 << 26)
 ARRAYS = Kind("arrays", 1 << 31)
 #: Settings, suites, labels of teeth: read by a parser that takes its time.
 SETTINGS = Kind("a text of settings", 1 << 20)
+#: What is only hashed.
+ANY = Kind("a file", 1 << 44)
 
 _SORTS = (
     (stat.S_ISDIR, "a folder"),
@@ -52,8 +54,15 @@ _SORTS = (
 )
 
 
+def sort_of(mode: int) -> str | None:
+    """What stands under a name that is no regular file, from its mode; None for a file."""
+    if stat.S_ISREG(mode):
+        return None
+    return next((name for is_sort, name in _SORTS if is_sort(mode)), "no file")
+
+
 @contextmanager
-def opened(path: Path, kind: Kind) -> Iterator[BinaryIO]:
+def opened(path: Path, kind: Kind) -> Iterator[BufferedReader]:
     """A file of the user's to read from; what its name leads to through links counts.
 
     Args:
@@ -71,9 +80,9 @@ def opened(path: Path, kind: Kind) -> Iterator[BinaryIO]:
         reason = getattr(error, "strerror", None) or str(error)
         raise UnusableFile(f"can't be read ({reason})") from error
     found = os.fstat(descriptor)
-    if not stat.S_ISREG(found.st_mode):  # before fdopen, which has errors of its own for folders
+    sort = sort_of(found.st_mode)
+    if sort is not None:  # before fdopen, which has errors of its own for folders
         os.close(descriptor)
-        sort = next((name for is_sort, name in _SORTS if is_sort(found.st_mode)), "no file")
         raise UnusableFile(f"is {sort}, not a file")
     with os.fdopen(descriptor, "rb") as file:
         if found.st_size > kind.most_bytes:

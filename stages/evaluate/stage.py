@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageContext
+from pipeline.untrusted.names import printable
 from pipeline.untrusted.paths import user_path
 from stages.evaluate.config import EvaluateConfig
 
@@ -41,7 +42,7 @@ class EvaluateStage(Stage):
         if config.mesh is not None:
             found["mesh/mesh.ply"] = _mesh_file(config)
         if config.masks is not None:
-            found |= {f"masks/{path.name}": path for path in _mask_files(config.masks)}
+            found |= {f"masks/{printable(path.name)}": path for path in _mask_files(config.masks)}
         weights = find_vgg_weights(config.lpips_weights)
         if weights is not None:
             found[f"lpips/vgg16{weights.suffix}"] = weights

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +13,8 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import matching_cameras, pinhole_camera, read_cameras
+from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, read
+from pipeline.untrusted.pictures import gray
 from stages.evaluate.held_out import without_lens
 
 Mask = npt.NDArray[np.bool_]
@@ -65,9 +66,12 @@ def scoring_mask(files: Mapping[str, Path], view: View) -> Mask | None:
     path = names.get(source) or names.get(PurePath(source).stem)
     if path is None:
         return None
-    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if stored is None:
-        raise RequestError(f"evaluate.masks: {path} is not a readable picture.")
+    try:
+        stored = gray(read(path, PHOTOGRAPH))
+    except UnusableFile as error:
+        raise RequestError(
+            f"evaluate.masks: the mask {path} {error}. Mend it, or leave it out."
+        ) from error
     height, width = stored.shape
     if (width, height) == view.source_size:
         source_from_working = np.linalg.inv(view.working_from_source)

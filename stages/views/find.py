@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from pipeline.errors import RequestError, nearest
+from pipeline.untrusted.files import sort_of
+from pipeline.untrusted.names import printable
+from pipeline.untrusted.pictures import KNOWN
 from stages.views.sampling import natural_key
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
@@ -17,7 +20,6 @@ VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
 )  # fmt: skip
 MASK_PREFIX = "masks/"
-KINDS_OF_IMAGE = "JPEG, PNG, TIFF, WebP, HEIC or BMP"
 
 
 @dataclass(frozen=True)
@@ -82,13 +84,13 @@ def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
         if len(paths) > 1:
             others = "other videos" if len(videos) == len(paths) else "photographs"
             raise RequestError(
-                f"The video {videos[0].name} was named together with {others} "
+                f"The video {printable(videos[0].name)} was named together with {others} "
                 f"({len(paths)} files in all). A case is either one video or a set of photographs: "
                 "name only the video, or only the photographs."
             )
-        return {videos[0].name: videos[0]}
+        return {printable(videos[0].name): videos[0]}
     if len(paths) < 2:
-        what = f"only {paths[0].name} was named" if paths else "none was named"
+        what = f"only {printable(paths[0].name)} was named" if paths else "none was named"
         raise RequestError(
             "A 3D scene needs at least two photographs from different sides, better three or more; "
             f"{what}. Name a folder of photographs, several files, or a video."
@@ -119,8 +121,10 @@ def find_masks(folder: Path, labels: Iterable[str]) -> dict[str, Path]:
         mask = entry.path
         if entry.is_folder or not is_image(mask):
             continue
-        fitting = [label for label in labels if PurePath(label).name == mask.stem]
-        fitting = fitting or [label for label in labels if PurePath(label).stem == mask.stem]
+        _refuse_special(mask, "The mask")
+        stem = printable(mask.stem)
+        fitting = [label for label in labels if PurePath(label).name == stem]
+        fitting = fitting or [label for label in labels if PurePath(label).stem == stem]
         if len(fitting) != 1:
             problem = (
                 f"several photographs ({', '.join(fitting[:3])})" if fitting else "no photograph"
@@ -152,7 +156,7 @@ def held_labels(labels: Iterable[str], held_out: Sequence[str]) -> tuple[str, ..
     """
     labels = list(labels)
     found = set()
-    for name in held_out:
+    for name in map(printable, held_out):
         fitting = [label for label in labels if name in (label, PurePath(label).name)]
         fitting = fitting or [label for label in labels if PurePath(label).stem == name]
         if len(fitting) != 1:
@@ -178,10 +182,11 @@ def _expand(item: str | Path) -> list[Path]:
         )
     if stat.S_ISDIR(status.st_mode):
         return _expand_folder(path)
+    _refuse_special(path, "Among the photographs,")
     if not is_image(path) and not is_video(path):
         raise RequestError(
-            f"The file {path.name} is neither a photograph nor a video by its name "
-            f"('{path.suffix or 'no suffix'}'). Photographs are {KINDS_OF_IMAGE}; videos are MP4, "
+            f"The file {printable(path.name)} is neither a photograph nor a video by its name "
+            f"('{path.suffix or 'no suffix'}'). Photographs are {KNOWN}; videos are MP4, "
             "MOV, MKV, AVI or WebM. Convert it, or leave it out."
         )
     return [path]
@@ -200,16 +205,30 @@ def _expand_pattern(path: Path) -> list[Path]:
             f"The pattern {path} {what}. Check the folder and the suffix (patterns tell JPG from "
             "jpg), and put it in quotes so that the shell leaves it alone."
         )
+    for match in usable:
+        _refuse_special(match, "Among the photographs,")
     return usable
+
+
+def _refuse_special(path: Path, what: str) -> None:
+    """Nothing but regular files is read: a pipe would make the run wait for ever."""
+    status = _stat(path)
+    sort = sort_of(status.st_mode) if status is not None else None  # missing: said when it is read
+    if sort is not None:
+        raise RequestError(
+            f"{what} {path} is {sort}, not a file. Remove it, or name the photographs one by one."
+        )
 
 
 def _expand_folder(folder: Path) -> list[Path]:
     entries = list_folder(folder)
     images = [entry.path for entry in entries if is_image(entry.path) and not entry.is_folder]
+    for image in images:
+        _refuse_special(image, "Among the photographs,")
     if images:
         return images
     videos = [entry.path.name for entry in entries if is_video(entry.path)]
-    advice = f"Photographs are {KINDS_OF_IMAGE}."
+    advice = f"Photographs are {KNOWN}."
     if videos:
         advice = f"To use the video, name it: {folder / videos[0]}"
     else:
@@ -260,7 +279,7 @@ def _labels(paths: Sequence[Path]) -> dict[str, Path]:
     labels: dict[str, Path] = {}
     waiting, depth = list(paths), 1
     while waiting:
-        tails = {path: "/".join(path.parts[-depth:]) for path in waiting}
+        tails = {path: printable("/".join(path.parts[-depth:])) for path in waiting}
         counts: dict[str, int] = {}
         for tail in tails.values():
             counts[tail] = counts.get(tail, 0) + 1
@@ -268,6 +287,8 @@ def _labels(paths: Sequence[Path]) -> dict[str, Path]:
         for path in unique:
             tail = tails[path]
             label = f"images/{tail}" if tail.startswith(MASK_PREFIX) else tail
+            while label in labels:  # a name that shows as another one is
+                label = f"{label}_"
             labels[label] = path
         waiting = [path for path in waiting if path not in set(unique)]
         depth += 1

@@ -13,8 +13,9 @@ import numpy as np
 
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
-from stages.views.decode import UnusableImage, decode_mask, decode_photo, large_images_allowed
-from stages.views.video import read_frames
+from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, read
+from stages.views.reading.apart import Decoder
+from stages.views.reading.video import VideoFrame, map_frames
 from stages.views.working import Mask, Prepared, check_size, prepare
 
 Progress = Callable[[int, int], None]
@@ -56,24 +57,30 @@ def load_photos(
 
     def load(label: str) -> Loaded | str:
         try:
-            data = _read(files[label])
-            photo = decode_photo(data, partial(check_size, long_side=long_side, min_side=min_side))
-            mask = _read_mask(masks[label]) if label in masks else None
+            data = read(files[label], PHOTOGRAPH)
+            check = partial(check_size, long_side=long_side, min_side=min_side)
+            photo = decoder.photo(data, check)
+            mask = _read_mask(masks[label], decoder) if label in masks else None
             picture = prepare(
                 photo.rgb, photo.valid, photo.orientation, photo.focal_px, long_side, mask
             )
-        except UnusableImage as error:
+        except UnusableFile as error:
             return f"{label} {error}"
         return Loaded(label, hashlib.sha256(data).hexdigest(), picture)
 
     loaded, problems = [], []
-    with large_images_allowed(), ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
-        for number, result in enumerate(pool.map(load, files), 1):
-            progress(number, len(files))
-            if isinstance(result, Loaded):
-                loaded.append(result)
-            else:
-                problems.append(result)
+    with Decoder() as decoder, ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
+        try:
+            for number, result in enumerate(pool.map(load, files), 1):
+                progress(number, len(files))
+                if isinstance(result, Loaded):
+                    loaded.append(result)
+                else:
+                    problems.append(result)
+        except BaseException:  # an interrupt does not wait for what is being decoded
+            decoder.stop()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     if problems:
         _refuse(problems, len(files))
     return loaded
@@ -88,21 +95,26 @@ def load_video(
     Raises:
         RequestError: the video or the mask can't be used.
     """
+
+    def prepared(frame: VideoFrame) -> tuple[int, float, Prepared]:
+        picture = prepare(frame.rgb, None, frame.orientation, None, long_side, given)
+        return frame.index, frame.seconds, picture
+
     try:
         check = partial(check_size, long_side=long_side, min_side=min_side)
-        found = read_frames(path, frames, threads, progress, check)
-        given = _read_mask(mask) if mask else None
-        with path.open("rb") as file:
+        given = None
+        if mask is not None:
+            with Decoder() as decoder:
+                given = _read_mask(mask, decoder)
+        with opened(path, FILM) as file:
+            found = map_frames(file, prepared, frames, threads, progress, check)
+            file.seek(0)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         return [
-            Loaded(
-                f"{label}#{frame.index}", digest,
-                prepare(frame.rgb, None, frame.orientation, None, long_side, given),
-                frame.seconds,
-            )
-            for frame in found
-        ]  # fmt: skip
-    except UnusableImage as error:
+            Loaded(f"{label}#{index}", digest, picture, seconds)
+            for index, seconds, picture in found
+        ]
+    except UnusableFile as error:
         raise RequestError(
             f"The video {label} {error}. Check that it plays, save it again as MP4 (H.264), or "
             "export single frames and name their folder instead."
@@ -154,18 +166,11 @@ def shows_nothing(picture: Prepared) -> bool:
     return bool(high - low < 12)
 
 
-def _read(path: Path) -> bytes:
+def _read_mask(path: Path, decoder: Decoder) -> Mask:
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UnusableImage(f"can't be read ({error.strerror or error})") from error
-
-
-def _read_mask(path: Path) -> Mask:
-    try:
-        return decode_mask(_read(path))
-    except UnusableImage as error:
-        raise UnusableImage(f"has a mask ({path.name}) that {error}") from error
+        return decoder.mask(read(path, PHOTOGRAPH))
+    except UnusableFile as error:
+        raise UnusableFile(f"has a mask ({path.name}) that {error}") from error
 
 
 def _refuse(problems: Sequence[str], total: int) -> None:

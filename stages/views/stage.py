@@ -10,6 +10,7 @@ from pydantic import Field
 
 from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageConfig, StageContext, runtime
+from pipeline.untrusted.names import printable
 from stages.views.find import MASK_PREFIX, find_images, find_masks, held_labels, is_video
 from stages.views.sampling import is_sequence, uniform_indices
 
@@ -68,9 +69,8 @@ class ViewsStage(Stage):
         inputs = [label for label in files if label not in held]
         kept = {inputs[i] for i in uniform_indices(len(inputs), config.frames)} | set(held)
         chosen = [label for label in files if label in kept]
-        named = {
-            f"{MASK_PREFIX}{masks[label].name}": masks[label] for label in chosen if label in masks
-        }
+        given = [masks[label] for label in chosen if label in masks]
+        named = {f"{MASK_PREFIX}{printable(mask.name)}": mask for mask in given}
         return {label: files[label] for label in chosen} | named
 
     def report(self) -> Parts:

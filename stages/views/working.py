@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stages.views.decode import UnusableImage
+from pipeline.untrusted.files import UnusableFile
 from stages.views.orientation import make_upright, upright_from_stored
 
 Mask = npt.NDArray[np.bool_]
@@ -41,10 +41,10 @@ def working_size(width: int, height: int, long_side: int) -> tuple[int, int]:
 
 
 def check_size(width: int, height: int, long_side: int, min_side: int) -> None:
-    """Raise UnusableImage where the short side would come out below `min_side`."""
+    """Raise UnusableFile where the short side would come out below `min_side`."""
     short = min(working_size(width, height, long_side))
     if short < min_side:
-        raise UnusableImage(
+        raise UnusableFile(
             f"is {width} x {height} pixels: at the working size its short side would be "
             f"{short} pixel{'s' if short > 1 else ''}, and {min_side} is the least "
             "(views.min_side). Is it a scan line or a thumbnail?"
@@ -66,7 +66,7 @@ def prepare(
         given_mask: a mask file: upright or stored size, or either's shape at another size.
 
     Raises:
-        UnusableImage: the mask has another shape than the picture, or leaves nothing of it.
+        UnusableFile: the mask has another shape than the picture, or leaves nothing of it.
     """
     height, width = rgb.shape[:2]
     small = working_size(width, height, long_side)
@@ -78,7 +78,7 @@ def prepare(
         share = given if share is None else np.minimum(share, given)
     mask = None if share is None else share >= 0.5
     if mask is not None and not mask.any():
-        raise UnusableImage("is masked completely (by its mask file or its transparency)")
+        raise UnusableFile("is masked completely (by its mask file or its transparency)")
     if mask is not None and mask.all():
         mask = None
     return Prepared(
@@ -109,7 +109,7 @@ def _fit_mask(mask: Mask, width: int, height: int, orientation: int) -> Mask:
         return mask
     if _same_shape(size, (width, height)):
         return make_upright(mask, orientation)
-    raise UnusableImage(
+    raise UnusableFile(
         f"has {upright[0]} x {upright[1]} pixels, but its mask {size[0]} x {size[1]}: the mask "
         "must have the picture's proportions"
     )

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.errors import RequestError
 from stages.views import find
-from stages.views.exif import focal_in_pixels, read_orientation
 from stages.views.find import find_images, find_masks
+from stages.views.reading.exif import focal_in_pixels, read_orientation
 from stages.views.sampling import is_sequence, natural_key, uniform_indices
 
 

@@ -12,9 +12,10 @@ import pillow_heif
 import pytest
 from PIL import Image, ImageCms, ImageOps
 
-from stages.views import decode
-from stages.views.decode import Photo, UnusableImage, decode_photo
+from pipeline.untrusted import pictures
+from pipeline.untrusted.files import UnusableFile
 from stages.views.orientation import make_stored, make_upright, upright_from_stored
+from stages.views.reading.decode import Photo, decode_photo
 from stages.views.working import prepare
 from tests.stages.views_pictures import ORIENTATION, Bytes, encode, scene
 
@@ -296,21 +297,21 @@ def damaged(kind: str, keep: float, **options: Any) -> bytes:
     ],
 )
 def test_damaged_files_say_what_is_wrong(data: bytes, reason: str) -> None:
-    with pytest.raises(UnusableImage, match=reason):
+    with pytest.raises(UnusableFile, match=reason):
         decode_photo(data)
 
 
 def test_damaged_sixteen_bit_png_is_not_half_decoded() -> None:
     noise = np.random.default_rng(0).integers(0, 65535, (80, 120, 3), np.uint16)
     data = cv2.imencode(".png", noise)[1].tobytes()
-    with pytest.raises(UnusableImage, match=r"truncated|damaged"):
+    with pytest.raises(UnusableFile, match=r"truncated|damaged"):
         decode_photo(data[: len(data) // 2])
 
 
 def test_too_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     data = encode(Image.new("RGB", (300, 200)), "PNG")
-    monkeypatch.setattr(decode, "MAX_PIXELS", 59_999)
-    with pytest.raises(UnusableImage, match="300 x 200"):
+    monkeypatch.setattr(pictures, "MAX_PIXELS", 59_999)
+    with pytest.raises(UnusableFile, match="300 x 200"):
         decode_photo(data)
 
 
@@ -318,12 +319,12 @@ def test_a_bomb_is_refused_by_its_header() -> None:
     # A header that promises 50,000 x 50,000 pixels over no data at all.
     data = bytearray(encode(Image.new("L", (8, 8)), "BMP"))
     data[18:22] = data[22:26] = (50_000).to_bytes(4, "little")
-    with decode.large_images_allowed(), pytest.raises(UnusableImage, match="50000 x 50000"):
+    with pytest.raises(UnusableFile, match="50000 x 50000"):
         decode_photo(bytes(data))
 
 
 def test_floating_point_images_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "float.tiff"
     Image.fromarray(np.zeros((80, 80), np.float32)).save(path)
-    with pytest.raises(UnusableImage, match="floating point"):
+    with pytest.raises(UnusableFile, match="floating point"):
         decode_photo(path.read_bytes())

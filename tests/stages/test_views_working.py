@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.views.decode import UnusableImage, decode_mask
+from pipeline.untrusted.files import UnusableFile
 from stages.views.orientation import make_stored
+from stages.views.reading.decode import decode_mask
 from stages.views.working import prepare, working_size
 from tests.stages.views_pictures import ORIENTATION, encode, scene
 
@@ -77,7 +78,7 @@ def test_mask_and_alpha_combine_and_fit_by_shape() -> None:
     assert not turned[:30].any()
     assert turned[30:].all()
     assert prepare(scene(), np.ones((80, 120), bool), 1, None, 60).mask is None
-    with pytest.raises(UnusableImage, match="proportions"):
+    with pytest.raises(UnusableFile, match="proportions"):
         prepare(scene(), None, 1, None, 60, np.ones((80, 80), bool))
-    with pytest.raises(UnusableImage, match="masked completely"):
+    with pytest.raises(UnusableFile, match="masked completely"):
         prepare(scene(), None, 1, None, 60, np.zeros((80, 120), bool))

@@ -1,0 +1,102 @@
+"""Which films are decoded: told from their first bytes, and nothing is read but the file itself.
+
+FFmpeg by itself would also follow playlists, concatenation scripts, patterns of names and network
+addresses that stand in a file named ``.mp4``. It gets an open file, the name of the one reader that
+may read it, and an answer of no to every other file that it asks for. Call this in a child only
+(`child`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
+
+from pipeline.untrusted.files import UnusableFile
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+KNOWN = "MP4, MOV, MKV, WebM, AVI, MPEG or WMV"
+#: 8K films have 33 megapixels.
+MAX_PIXELS = 70_000_000
+#: Bytes that decoding may take: 8K at 10 bits with twenty frames held.
+MOST_MEMORY = 4 << 30
+
+_ATOMS = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"uuid")
+_STARTS = (
+    (b"\x1aE\xdf\xa3", "matroska"),
+    (b"\x30\x26\xb2\x75\x8e\x66\xcf\x11", "asf"),
+    (b"\0\0\1\xba", "mpeg"),
+    (b"\0\0\1\xb3", "mpegvideo"),
+)
+_TEXTS = ((b"ffconcat", "a script of film names"), (b"#EXTM3U", "a playlist"))
+#: Bytes of the start of a film that `reader_for` looks at.
+HEAD = 1024
+
+
+def reader_for(head: bytes) -> str:
+    """FFmpeg's name of the reader of a film, from its first bytes.
+
+    Raises:
+        UnusableFile: it is no film of a known format.
+    """
+    if not head:
+        raise UnusableFile("is empty (0 bytes)")
+    if head[4:8] in _ATOMS:
+        return "mov"
+    for start, name in _STARTS:
+        if head.startswith(start):
+            return name
+    if head[:4] == b"RIFF" and head[8:11] == b"AVI":
+        return "avi"
+    for first, step in ((0, 188), (4, 192), (0, 204)):
+        if len(head) > first + 3 * step and set(head[first : first + 4 * step : step]) == {0x47}:
+            return "mpegts"
+    for start, name in _TEXTS:
+        if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(start):
+            raise UnusableFile(
+                f"can't be read as a video: it is {name}, and only films themselves are read "
+                f"({KNOWN})"
+            )
+    printable = sum(byte in b"\t\n\r\f" or byte >= 32 for byte in head)
+    sort = "a text file" if printable == len(head) else f"not {KNOWN} by its content"
+    raise UnusableFile(f"can't be read as a video: it is {sort}")
+
+
+def opened_film(file: BinaryIO) -> InputContainer:
+    """A film, opened by the reader of its format only.
+
+    Args:
+        file: at any place; what it is called does not matter.
+
+    Raises:
+        UnusableFile: it is no film of a known format.
+        av.error.FFmpegError, ValueError: it is damaged.
+    """
+    import av
+
+    file.seek(0)
+    reader = reader_for(file.read(HEAD))
+    file.seek(0)
+    options = {
+        "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf",
+        "protocol_whitelist": "none",
+        "max_pixels": str(MAX_PIXELS),
+        "max_streams": "100",
+    }
+    if reader == "mov":
+        options |= {"enable_drefs": "0", "use_absolute_path": "0"}
+    container: Any = av.open(
+        _Nameless(file), format=reader, options=options, io_open=_refuse, metadata_errors="replace"
+    )
+    return container
+
+
+class _Nameless:
+    """A file to read from without the name that FFmpeg would resolve other names against."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.read, self.seek, self.tell = file.read, file.seek, file.tell
+
+
+def _refuse(url: str, flags: int, options: dict[str, Any]) -> NoReturn:
+    raise PermissionError(f"a film may not name other files ({url})")
