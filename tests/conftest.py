@@ -14,7 +14,8 @@ from tests.personal_data import with_personal_data
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
 SHORT = {
-    "fit.iterations": 150,
+    "views.long_side": 384,
+    "fit.iterations": 120,
     "export.video_seconds": 1,
     "export.mesh_faces": 5000,
 }
