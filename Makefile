@@ -8,7 +8,8 @@ RATE ?= 0.003
 BIN := .venv/bin
 
 SEED ?= 0
-COUNT ?= 20
+INPUTS ?= 1000
+KILLS ?= 30
 .PHONY: demo test lint wheel-test docs bench soak reader system chromium clean
 
 demo: system .venv/installed
@@ -35,8 +36,9 @@ bench: .venv/installed-dev
 
 # What takes too long for the test suite: kills, full disks, and damaged files by the thousand.
 soak: .venv/installed-dev
-	for script in $$(grep -l 'def main' tests/soak/*.py); do \
-	    $(BIN)/python $$script --seed $(SEED) --count $(COUNT) || exit 1; done
+	$(BIN)/python tests/soak/fuzz_media.py --seed $(SEED) --count $(INPUTS)
+	$(BIN)/python tests/soak/fuzz_numbers.py --seed $(SEED) --count $(INPUTS) --quiet
+	$(BIN)/python tests/soak/kill_resume.py --seed $(SEED) --count $(KILLS)
 
 # The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: hours.
 # START=FILE goes on from weights that an earlier training wrote (4000 steps at RATE=0.002 then do).

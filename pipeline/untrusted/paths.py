@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import AfterValidator
+from pydantic_core import PydanticCustomError
 
 from pipeline.errors import RequestError
+
+Given = TypeVar("Given", str, Path)
 
 
 def user_path(text: str | Path, setting: str) -> Path:
@@ -18,22 +24,36 @@ def user_path(text: str | Path, setting: str) -> Path:
     Raises:
         RequestError: there is no such user, or no file system has such a name.
     """
+    trouble = _trouble(text)
+    if trouble is not None:
+        raise RequestError(f"{setting}: {_shown(text)} {trouble}.")
+    return Path(text).expanduser()
+
+
+def _trouble(text: str | Path) -> str | None:
     try:
-        path = Path(text).expanduser()
-        os.lstat(path)
+        os.lstat(Path(text).expanduser())
     except FileNotFoundError:
-        pass
-    except RuntimeError as error:  # expanduser: ~nobody
-        raise RequestError(
-            f"{setting}: {_shown(text)} begins with the home of a user that there isn't. Give the "
-            "whole path."
-        ) from error
+        return None
+    except RuntimeError:  # expanduser: ~nobody
+        return "begins with the home of a user that there isn't. Give the whole path"
     except (OSError, ValueError) as error:  # too long, or a zero byte
         reason = getattr(error, "strerror", None) or str(error)
-        raise RequestError(
-            f"{setting}: {_shown(text)} can't be looked for ({reason.lower()}). Check the path."
-        ) from error
-    return path
+        return f"can't be looked for ({reason.lower()}). Check the path"
+    return None
+
+
+def _possible(text: Given) -> Given:
+    trouble = _trouble(text)
+    if trouble is not None:
+        raise PydanticCustomError("path", "{why}", {"why": f"it {trouble}"})
+    return text
+
+
+#: For settings that are paths: what no file can be called is refused before anything runs. Whether
+#: it is there is told by the stage that wants it.
+POSSIBLE = AfterValidator(_possible)
+GivenPath = Annotated[str, POSSIBLE]
 
 
 def _shown(text: str | Path) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from pipeline.stage import StageConfig, runtime
+from pipeline.untrusted.paths import GivenPath
 
 Channel = Annotated[float, Field(ge=0, le=1)]
 Distance = Annotated[float, Field(gt=0)]
@@ -28,15 +29,15 @@ class EvaluateConfig(StageConfig):
         0.25, gt=0, le=1, description="Error (0..1) that has the brightest colour in the pictures."
     )
     save_renders: bool = Field(False, description="Also write render_<view>.png of every view.")
-    ground_truth: str | None = runtime(
+    ground_truth: GivenPath | None = runtime(
         None,
         description="True cameras of the photographs, input and held out, by file name: a "
         "transforms.json or the folder of a COLMAP model. Its contents count, not its place.",
     )
-    mesh: str | None = runtime(
+    mesh: GivenPath | None = runtime(
         None, description="True surface (.ply) in the world of the ground truth."
     )
-    masks: str | None = runtime(
+    masks: GivenPath | None = runtime(
         None,
         description="Folder of masks for scoring, named as the photographs, 255 where the figures "
         "with `_mask` (and the geometry) count, such as on teeth.",
@@ -46,7 +47,7 @@ class EvaluateConfig(StageConfig):
         description="Cameras of held-out photographs: registered by the ground truth alone, or "
         "then refined photometrically with the scene as it is.",
     )
-    lpips_weights: str | None = runtime(
+    lpips_weights: GivenPath | None = runtime(
         None,
         description="torchvision's VGG-16 weights (.pth or .safetensors) for LPIPS; default: those "
         "in torch's cache. Without any, lpips is null.",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pipeline.stage import StageConfig, runtime
-from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.paths import GivenPath, user_path
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.sfm.options import RefinementOptions
@@ -127,14 +127,16 @@ class RefinementConfig(StageConfig):
 class PointmapConfig(StageConfig):
     """Pointmaps of a learned model, or made elsewhere."""
 
-    checkpoint: str | None = runtime(
+    checkpoint: GivenPath | None = runtime(
         None, description="the model's weights, a file or folder; nothing is ever downloaded"
     )
     package: str | None = Field(None, description="Python package, if not the model's usual one")
-    package_folder: str | None = runtime(
+    package_folder: GivenPath | None = runtime(
         None, description="a checkout to import the package from, if it is not installed"
     )
-    files: str | None = runtime(None, description="folder of .npz pointmaps, for method files")
+    files: GivenPath | None = runtime(
+        None, description="folder of .npz pointmaps, for method files"
+    )
     file_names: Literal["auto", "source", "neutral"] = Field(
         "auto", description="what their names say: photographs' file names, or 000, 001, ..."
     )
@@ -186,7 +188,7 @@ class DentalConfig(StageConfig):
         description="what each photograph shows, in the order of the file names: right or left "
         "buccal, frontal, between; null: found out",
     )
-    labels: str | tuple[ToothConfig, ...] = Field(
+    labels: GivenPath | tuple[ToothConfig, ...] = Field(
         (),
         description="what a person says of the teeth: a file as the page check.html saves it, or "
         "a list of teeth whose number is known; teeth.yaml in the workspace is used by itself",
@@ -266,7 +268,7 @@ class InitConfig(StageConfig):
         "auto", "known", "colmap", "dental",
         "dust3r", "mast3r", "must3r", "vggt", "mapanything", "files",
     ] = Field("auto", description="how to find the cameras")  # fmt: skip
-    cameras: str | None = runtime(
+    cameras: GivenPath | None = runtime(
         None,
         description="cameras that are known: folder of a COLMAP model, or a transforms.json; the "
         "poses and lenses are taken as they are",

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from pipeline.errors import RequestError
 from pipeline.stage import Stage, StageConfig, StageContext, runtime
+from pipeline.untrusted.paths import GivenPath
 
 SETTING = "swap.cameras"
 
@@ -21,7 +22,7 @@ SETTING = "swap.cameras"
 class SwapConfig(StageConfig):
     """Settings of the stage `swap`."""
 
-    cameras: str | None = runtime(
+    cameras: GivenPath | None = runtime(
         None,
         description="cameras to use from here on: folder of a COLMAP model, or a transforms.json",
     )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path, PurePath
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageConfig, StageContext, runtime
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.paths import POSSIBLE
 from stages.views.find import MASK_PREFIX, find_images, find_masks, held_labels, is_video
 from stages.views.sampling import is_sequence, uniform_indices
 
@@ -32,7 +33,7 @@ class ViewsConfig(StageConfig):
         64, ge=16, le=4096,
         description="refuse photographs whose short side is less than this at working size",
     )  # fmt: skip
-    masks: Path | None = runtime(
+    masks: Annotated[Path, POSSIBLE] | None = runtime(
         None,
         description="folder of masks named as the photographs, bright where these may be used "
         "(their contents count, not their place)",

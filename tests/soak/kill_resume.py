@@ -2,7 +2,7 @@
 
     python tests/soak/kill_resume.py --seed 0 --count 20
 
-Not part of the test suite: it takes many minutes (`make soak SEED=1 COUNT=50`). `pipeline run`,
+Not part of the test suite: it takes many minutes (`make soak SEED=1 KILLS=50`). `pipeline run`,
 `compare` and `benchmark` get SIGKILL, SIGTERM and SIGINT; after each, no process may be left, and
 the exit status must be right. In the end the same command must have made the same bytes as one that
 nobody disturbed, with no half-written files, no lock held, and nothing that others can read. Prints
