@@ -208,11 +208,22 @@ def test_a_damaged_stl_is_refused(tmp_path: Path, content: bytes, words: str) ->
     assert words in said or (words == "cut off" and "line" in said)
 
 
+def test_an_obj_without_a_last_line_break_is_whole_if_all_vertices_have_faces(
+    tmp_path: Path,
+) -> None:
+    for name, content in (("a.obj", obj()), ("b.obj", obj()[:-1])):
+        (tmp_path / name).write_bytes(content)
+    first, second = (Mesh.read(tmp_path / name, "evaluate.mesh") for name in ("a.obj", "b.obj"))
+    assert np.array_equal(first.vertices, second.vertices)
+    beside = np.array([[0.2, 0.1, -1.0]])
+    assert np.array_equal(first.closest(beside), second.closest(beside))
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         (b"\n", "holds no triangles"),
-        (obj()[:-1], "last line has no end"),
+        (obj()[: obj().index(b"3//2") + 4], "last line has no end"),
         (obj().replace(b" 3//2", b" 5//2"), "has the vertex 4, and there are 4"),
         (obj().replace(b"f 1/1/1 2 3//2", b"f 1 2"), "2 corners"),
         (obj().replace(b"f 1/1/1 2 3//2", b"f"), "0 corners"),

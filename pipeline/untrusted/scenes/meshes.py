@@ -146,12 +146,12 @@ def _stl_text(data: bytes) -> npt.NDArray[np.float64]:
 
 
 def _obj(path: Path) -> tuple[Vertices, Triangles]:
-    """Vertices and faces; all else (materials, normals, textures, lines) is passed over."""
+    """Vertices and faces; all else (materials, normals, textures, lines) is passed over.
+
+    The format has no counts. Some programs leave the last line without an end; where it has none,
+    each vertex must have a face, as a file that was cut off among its faces hardly has.
+    """
     data = read(path, MESH)
-    if not data.endswith((b"\n", b"\r")):
-        raise UnusableFile(
-            "is cut off: its last line has no end (if it is whole, add a line break there)"
-        )
     if b"\0" in data:
         raise UnusableFile("is no OBJ: it holds zero bytes, which are no text")
     vertices, corners, lengths = array("d"), array("q"), array("q")
@@ -171,10 +171,13 @@ def _obj(path: Path) -> tuple[Vertices, Triangles]:
     if not lengths:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint32)
     count = len(vertices) // 3
-    return (
-        np.frombuffer(vertices, np.float64).reshape(-1, 3),
-        _fans(np.array(lengths), np.array(corners), count),
-    )
+    faces = _fans(np.array(lengths), np.array(corners), count)
+    if not data.endswith((b"\n", b"\r")) and len(np.unique(faces)) < count:
+        raise UnusableFile(
+            "is cut off: its last line has no end, and there are vertices without a face (if it is "
+            "whole, add a line break there)"
+        )
+    return np.frombuffer(vertices, np.float64).reshape(-1, 3), faces
 
 
 def _corner(text: bytes, vertices: int, line: int) -> int:
