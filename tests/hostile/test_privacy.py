@@ -103,6 +103,7 @@ def test_a_report_without_names(sample_run: RunSummary) -> None:
     assert told(page, (*PERSONAL, *of_this_computer(sample_run), "sample_run")) == []
     text = page.read_text()
     assert not re.search(r'<a href="(?!#)', text), "what it leads to is not passed on"
+    assert "their file names" in open_page.read_text() and "their file names" not in text
     assert "photographs placed in space" in text and "Time and memory" in text
 
 
