@@ -228,7 +228,7 @@ def plan_stage(
     stage = get_stage(name)
     inputs = stage_inputs(stage, table)
     pointer = store.pointer(name)
-    failure = store.failure(name)
+    failure = store.failures.of(name)
     waiting = sorted({entry.stage for entry in inputs.values() if entry.result is None})
     if waiting:
         state = "pending" if pointer else "missing"

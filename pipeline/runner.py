@@ -374,11 +374,11 @@ class Runner:
         with contextlib.suppress(OSError):  # the first error is the one to tell
             self.store.discard_outputs(name, key)
         if isinstance(failure, ReconstructionError):
-            folder = self.store.keep_evidence(name, failure.pictures, failure.artifacts)
+            folder = self.store.failures.keep(name, failure.pictures, failure.artifacts)
             if failure.pictures:
                 failure.args = (f"{failure} Pictures that show it: {folder}",)
         with contextlib.suppress(OSError):
-            self.store.record_failure(name, key, str(failure))
+            self.store.failures.record(name, key, str(failure))
         return failure
 
 

@@ -11,7 +11,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.artifacts import artifact_class
-from pipeline.store import Result, Store
+from pipeline.store import Result
+from pipeline.store.failures import Failures
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Case:
 
     def evidence(self, kind: str) -> Any:
         """The artifact of a kind that the failed stage kept although it isn't safe, or None."""
-        return Store(self.workspace).evidence(self.failed.name, kind) if self.failed else None
+        return Failures(self.workspace).evidence(self.failed.name, kind) if self.failed else None
 
     def warnings(self) -> Iterator[tuple[str, str]]:
         """(stage, warning) of all results."""

@@ -1,10 +1,9 @@
 """The artifact store: what is computed once stays, whole and unchanged, until nobody needs it."""
 
 from pipeline.store.faults import file_in_the_way, is_disk_full
-from pipeline.store.records import read_own, write_sealed
+from pipeline.store.records import MANIFEST, read_own, write_sealed
 from pipeline.store.store import (
     KEY_LENGTH,
-    MANIFEST,
     CorruptResultError,
     Result,
     Store,

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipeline.files import sha256_text, write_atomic
 from pipeline.untrusted.files import Kind, UnusableFile, read
 
+MANIFEST = "manifest.json"
 #: Manifests of 10,000 files have 2 MB.
 RECORD = Kind("a record of the workspace", 1 << 26)
 

@@ -18,9 +18,8 @@ Layout of a workspace::
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +40,9 @@ from pipeline.process.privacy import share_for
 from pipeline.store import checks
 from pipeline.store.checks import mark_of
 from pipeline.store.cleaning import PARTIAL, checkpoints, clean, holds_checkpoint
-from pipeline.store.faults import is_full, reason_of
+from pipeline.store.failures import EVIDENCE, FAILURE, Failures
+from pipeline.store.faults import reason_of
+from pipeline.store.links import link_to
 from pipeline.store.locks import locked
 from pipeline.store.places import (
     is_folder,
@@ -53,16 +54,15 @@ from pipeline.store.places import (
 )
 from pipeline.store.readers import tell, tighten_workspace
 from pipeline.store.records import (
+    MANIFEST,
     DamagedError,
-    Failure,
     Pointer,
     read_manifest,
     read_record,
     write_sealed,
 )
 
-MANIFEST = "manifest.json"
-POINTER, FAILURE = "current.json", "failure.json"
+POINTER = "current.json"
 KEY_LENGTH = 12
 #: Of manifests: 2 has a checksum.
 FORMAT = 2
@@ -102,6 +102,7 @@ class Store:
     """The results in one workspace folder.
 
     Attributes:
+        failures: why stages failed.
         said: what was found damaged, and what was done about it.
 
     Args:
@@ -111,6 +112,7 @@ class Store:
 
     def __init__(self, root: Path, *, verify: bool = False) -> None:
         self.root = root
+        self.failures = Failures(root)
         self._verify = verify
         self._marks: dict[Path, checks.Known] = {}
         self.said: list[str] = []
@@ -242,7 +244,7 @@ class Store:
                 set_aside(folder / POINTER)
             write_sealed(folder / POINTER, pointer)
         remove(folder / FAILURE)
-        remove(folder / "failure")
+        remove(folder / EVIDENCE)
 
     def quarantine(self, stage: str, folder: Path, why: str = "") -> None:
         """Move a damaged result aside. It is kept for inspection until the next `clean`."""
@@ -326,82 +328,12 @@ class Store:
         """Did a killed run of this key leave something to go on from?"""
         return holds_checkpoint(self._partial(stage, key))
 
-    def record_failure(self, stage: str, key: str, message: str) -> None:
-        """Remember why a stage failed, for `status`. A full disk must not hide the first error."""
-        path = stage_folder(self.root, stage) / FAILURE
-        try:
-            if is_folder(path):
-                set_aside(path)
-            write_sealed(path, {"key": key, "message": message})
-        except OSError as error:
-            if not is_full(error):
-                raise
-
-    def keep_evidence(
-        self, stage: str, images: Mapping[str, Any], artifacts: Mapping[str, Any]
-    ) -> Path:
-        """Keep what a failed stage drew and made, instead of what an earlier failure left.
-
-        Args:
-            images: name -> picture of the trouble.
-            artifacts: kind -> artifact that was made, but isn't safe.
-        """
-        from pipeline.artifacts.pictures import Pictures
-
-        folder = self.root / stage / "failure"
-        remove(folder)
-        if images or artifacts:
-            folder.mkdir(parents=True)
-        if images:
-            Pictures(images).save(folder)
-        for kind, artifact in artifacts.items():
-            (folder / kind).mkdir()
-            artifact.save(folder / kind)
-        return folder
-
-    def evidence(self, stage: str, kind: str) -> Any:
-        """The artifact that `keep_evidence` last kept of a failed stage, or None."""
-        folder = self.root / stage / "failure" / kind
-        return artifact_class(kind).load(folder) if folder.is_dir() else None
-
-    def failure(self, stage: str) -> dict[str, Any] | None:
-        """What `record_failure` last wrote, if no run has succeeded since."""
-        try:
-            failure = read_record(self.root / stage / FAILURE, Failure)
-        except DamagedError:  # the stage will be tried again
-            return None
-        return failure.model_dump() if failure else None
-
     def link_results(self, result: Result, kind: str) -> Path:
-        """Point ``WORKSPACE/results`` at the exports in use.
-
-        What a copy of the workspace made a folder of becomes a link again; any other folder or file
-        of that name is set aside.
-        """
-        link = self.root / "results"
-        target = os.path.relpath(result.folder / kind, self.root)
-        if link.is_symlink() and os.readlink(link) == target:  # noqa: PTH115
-            return link
-        if is_folder(link) and self._is_copy(link, result.stage, kind):
-            remove(link)
-        elif is_there(link) and not link.is_symlink():
-            aside = set_aside(link)
+        """Point ``WORKSPACE/results`` at the exports in use."""
+        link, aside = link_to(self.root, "results", result.folder / kind, result.stage)
+        if aside is not None:
             self._say(f"{link} was no link of ours; it was moved to {aside.name}.")
-        temporary = temporary_beside(link)
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(target)
-        temporary.replace(link)
         return link
-
-    def _is_copy(self, folder: Path, stage: str, kind: str) -> bool:
-        """Does a folder hold what a result of a stage holds, byte for byte?"""
-        listing = folder_listing(folder)
-        for path in (self.root / stage).glob(f"*/{MANIFEST}"):
-            with suppress(DamagedError):
-                outputs = (read_manifest(path) or {}).get("outputs", {})
-                if kind in outputs and outputs[kind]["files"] == listing:
-                    return True
-        return False
 
     def _partial(self, stage: str, key: str) -> Path:
         return self.root / stage / partial_name(key)

@@ -376,11 +376,11 @@ def test_what_a_failed_stage_made_is_kept_until_one_succeeds(
         run("count.fail=drawn")
     folder = toys / "w" / "count" / "failure"
     assert sorted(path.name for path in folder.iterdir()) == ["pair.png", "teeth"]
-    assert len(Store(toys / "w").evidence("count", "teeth").views) == 3
+    assert len(Store(toys / "w").failures.evidence("count", "teeth").views) == 3
     with pytest.raises(ReconstructionError, match=r"^Doubtful. To put it right, open"):
         run("count.fail=plain")
     assert [path.name for path in folder.iterdir()] == ["teeth"]
-    assert "check.html" not in (Store(toys / "w").failure("count") or {})["message"]
+    assert "check.html" not in (Store(toys / "w").failures.of("count") or {})["message"]
     assert (toys / "w" / "check.html").is_file()
     made.clear()
     with pytest.raises(ReconstructionError, match=r"^Doubtful.$"):

@@ -32,8 +32,8 @@ def doubtful_case(folder: Path, teeth: Teeth | None = None, failure: str = "Doub
     (folder / "request.json").write_text(json.dumps(request))
     write_result(folder, "views", [case.views()])
     store = Store(folder)
-    store.keep_evidence("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
-    store.record_failure("init", "key", failure)
+    store.failures.keep("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
+    store.failures.record("init", "key", failure)
     return folder
 
 
@@ -70,7 +70,7 @@ def test_numbered_teeth_of_a_run_that_succeeded_can_be_checked_too(tmp_path: Pat
     picture = np.full((20, 30, 3), 90, np.uint8)
     numbered = replace(case.teeth("it is blurred"), pictures={"000": picture})
     write_result(workspace, "init", [numbered])
-    assert store.failure("init") is None
+    assert store.failures.of("init") is None
     report = run_report(workspace).read_text()
     assert (workspace / "check.html").is_file()
     assert "Check the teeth" in report
@@ -231,7 +231,7 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
 
     # A second look: what was put right before stays in the file that the page writes.
     store = Store(workspace)
-    store.keep_evidence("init", {}, {"teeth": Teeth(after)})
+    store.failures.keep("init", {}, {"teeth": Teeth(after)})
     run_report(workspace)
     again = data_of((workspace / "check.html").read_text())["photographs"]
     assert [len(photo["earlier"]["crowns"]) for photo in again] == [2, 8, 12]
@@ -339,6 +339,6 @@ def test_a_mirror_image_is_turned_over_in_a_browser(tmp_path: Path) -> None:
     assert [(view.mirrored, view.kind) for view in after] == [(True, "left"), (True, "front")]
 
     # A second look: all stays as it was said.
-    Store(workspace).keep_evidence("init", {}, {"teeth": Teeth(after)})
+    Store(workspace).failures.keep("init", {}, {"teeth": Teeth(after)})
     again = probed(workspace, tmp_path / "browser", READ, "result.row = row(0).join(' ');")
     assert again == {"yaml": result["yaml"], "row": result["end"][0]}

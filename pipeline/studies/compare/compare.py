@@ -220,7 +220,7 @@ def _entries_of(store: Store) -> list[Entry]:
             if "points" in result.contents:
                 entry.points = _loaded(store, result, "points").positions
             entry.row["seconds"] = round(seconds, 1)
-        elif failure := store.failure(name):
+        elif failure := store.failures.of(name):
             entry.row["failure"] = failure["message"]
         if entry.cameras or entry.points is not None or "failure" in entry.row:
             found.append(entry)

@@ -60,7 +60,7 @@ def read_case(workspace: Path) -> Case:
 
 
 def _failure(store: Store, name: str) -> str | None:
-    failure = store.failure(name)
+    failure = store.failures.of(name)
     return str(failure["message"]) if failure else None
 
 
