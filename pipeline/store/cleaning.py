@@ -62,9 +62,12 @@ def checkpoints(root: Path) -> dict[str, int]:
 
 
 def holds_checkpoint(partial: Path) -> bool:
-    """Is there something to go on from in the folder of a stopped run?"""
+    """Is there something to go on from in the folder of a stopped run?
+
+    What ends in ``.tmp`` is half written, or was of use to that run alone.
+    """
     scratch = partial / "scratch"
-    return is_folder(scratch) and any(scratch.iterdir())
+    return is_folder(scratch) and any(path.suffix != ".tmp" for path in scratch.iterdir())
 
 
 def _unused(folder: Path, keep: int, in_use: str, manifest: str) -> list[Path]:

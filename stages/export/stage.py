@@ -158,6 +158,7 @@ class ExportStage(Stage):
             page_bytes = _write_page(context, scene, folder) if config.viewer else 0
             context.progress("mesh", 0, 1)
             mesh = making.result()
+            context.progress("mesh", 1, 1)
         if mesh is not None:
             write_mesh_ply(folder / "mesh.ply", mesh)
             write_stl(folder / "mesh.stl", mesh)

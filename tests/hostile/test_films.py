@@ -17,8 +17,8 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.films import reader_for
-from stages.views.reading.video import read_frames
 from stages.views.stage import ViewsConfig, ViewsStage
+from tests.films import read_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 BRIGHT = 200

@@ -153,3 +153,12 @@ def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:
     Store(tmp_path).create()
     assert sorted(tmp_path.rglob("*.tmp")) == sorted((own, elsewhere, foreign))
     assert value_of(Store(tmp_path)) == 1
+
+
+def test_half_a_checkpoint_is_none(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    scratch = store.begin("fit", "c" * 64) / "scratch"
+    (scratch / "fit.npz.tmp").write_text("half")
+    assert not store.has_checkpoint("fit", "c" * 64)
+    (scratch / "fit.npz").write_text("whole")
+    assert store.has_checkpoint("fit", "c" * 64)

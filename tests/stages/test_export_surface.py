@@ -4,8 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import open3d
+import pytest
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.errors import StageError
+from stages.export.mesh.building import MeshHere, MeshProcess, MeshTask
 from stages.export.mesh.files import write_mesh_ply, write_stl
 from stages.export.mesh.surface import (
     Mesh,
@@ -152,3 +155,32 @@ def test_the_files_open_elsewhere(tmp_path: Path) -> None:
     np.testing.assert_allclose(stl.get_surface_area(), ply.get_surface_area(), rtol=1e-5)
     data = (tmp_path / "mesh.stl").read_bytes()
     assert len(data) == 84 + 50 * len(mesh)
+
+
+def ball_task() -> MeshTask:
+    cameras, images, depths = zip(*ball_frames(), strict=True)
+    points = fused().vertices[::7].astype(np.float32)
+    return MeshTask(
+        "tsdf", np.array([[c.width, c.height, c.fx, c.fy, c.cx, c.cy] for c in cameras], float),
+        np.array([c.cam_from_world for c in cameras]), images, depths,
+        points, points, np.ones_like(points), 0.5, VOXEL, 2.0, 7, 2000,
+    )  # fmt: skip
+
+
+def test_a_process_of_its_own_makes_the_same_mesh_and_leaves_nothing(tmp_path: Path) -> None:
+    task = ball_task()
+    with MeshHere(task) as here, MeshProcess(task, tmp_path) as apart:
+        wanted, found = here.result(), apart.result()
+    assert wanted is not None and found is not None
+    assert 1000 < len(wanted) <= 2000
+    for name in ("vertices", "faces", "colors"):
+        assert (getattr(wanted, name) == getattr(found, name)).all()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_that_fails_is_explained(tmp_path: Path) -> None:
+    with MeshProcess(ball_task(), tmp_path) as apart:
+        (tmp_path / "mesh_task.tmp").write_bytes(b"no task")
+        with pytest.raises(StageError, match=r"mesh could not be made.*export\.mesh=false"):
+            apart.result()
+    assert not list(tmp_path.iterdir())

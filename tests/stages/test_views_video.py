@@ -14,8 +14,8 @@ from PIL import Image
 
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
-from stages.views.reading.video import read_frames
 from stages.views.stage import ViewsConfig, ViewsStage
+from tests.films import read_frames
 
 QUARTER_TURN_CLOCKWISE = (0, 1, -1, 0)  # a, b, c, d: x' = a x + c y, y' = b x + d y
 

@@ -81,17 +81,18 @@ class MeshTask:
     most_faces: int
 
     def save(self, path: Path) -> None:
-        """Write it to an ``.npz``."""
+        """Write it, as an ``.npz``."""
         named = {
             f"{name}_{k}": array
             for name in ("images", "depths") for k, array in enumerate(getattr(self, name))
         }  # fmt: skip
         numbers = [self.reach, self.voxel, self.smoothing, self.octree, self.most_faces]
-        np.savez(
-            path, method=self.method, lenses=self.lenses, poses=self.poses,
-            positions=self.positions, normals=self.normals, colors=self.colors,
-            numbers=np.array(numbers, np.float64), **named,
-        )  # fmt: skip
+        with path.open("wb") as file:
+            np.savez(
+                file, method=self.method, lenses=self.lenses, poses=self.poses,
+                positions=self.positions, normals=self.normals, colors=self.colors,
+                numbers=np.array(numbers, np.float64), **named,
+            )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path) -> MeshTask:
@@ -214,13 +215,12 @@ class MeshProcess:
 
     Args:
         task: what to make.
-        folder: to exchange files in.
+        folder: to exchange files in; none of them is left there.
     """
 
     def __init__(self, task: MeshTask, folder: Path) -> None:
-        self._task, self._mesh = folder / "mesh_task.npz", folder / "mesh_made.npz"
-        self._log = folder / "mesh_log.txt"
-        self._mesh.unlink(missing_ok=True)
+        self._task, self._mesh = folder / "mesh_task.tmp", folder / "mesh_made.tmp"
+        self._log = folder / "mesh_log.tmp"
         task.save(self._task)
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
@@ -235,6 +235,8 @@ class MeshProcess:
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()
+        for path in (self._task, self._mesh, self._log):
+            path.unlink(missing_ok=True)
 
     def result(self) -> Mesh | None:
         """Wait for the mesh.
@@ -259,10 +261,11 @@ class MeshProcess:
 def main(task: str, out: str) -> None:
     """Make the mesh of a task's file."""
     mesh = make_mesh(MeshTask.load(Path(task)))
-    if mesh is None:
-        np.savez(out, found=False)
-    else:
-        np.savez(out, found=True, vertices=mesh.vertices, faces=mesh.faces, colors=mesh.colors)
+    with Path(out).open("wb") as file:
+        if mesh is None:
+            np.savez(file, found=False)
+        else:
+            np.savez(file, found=True, vertices=mesh.vertices, faces=mesh.faces, colors=mesh.colors)
 
 
 if __name__ == "__main__":

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.untrusted.child import Child, seconds_for
-from pipeline.untrusted.files import FILM, UnusableFile, opened
+from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.films import MOST_MEMORY
 
 #: Each thread of the decoder holds frames of its own.
@@ -36,18 +35,6 @@ class VideoFrame:
     rgb: npt.NDArray[np.uint8]
     orientation: int
     seconds: float
-
-
-def read_frames(
-    path: Path,
-    wanted: int,
-    threads: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    check_size: Callable[[int, int], None] = lambda width, height: None,
-) -> list[VideoFrame]:
-    """Read `wanted` frames at full size: `map_frames` that keeps them all."""
-    with opened(path, FILM) as file:
-        return map_frames(file, lambda frame: frame, wanted, threads, progress, check_size)
 
 
 def map_frames(
