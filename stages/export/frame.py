@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.points import Points
+from stages.splatting.harmonics import harmonics
 
 Array = npt.NDArray[np.float64]
 
@@ -30,27 +31,6 @@ def split_similarity(similarity: Array) -> tuple[float, Array, Array]:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
         raise ValueError("not a similarity: it stretches the scene unevenly")
     return scale, rotation, matrix[:3, 3]
-
-
-def harmonics(directions: npt.NDArray[np.floating]) -> Array:
-    """The 16 real spherical harmonics of 3DGS at unit directions [M, 3] -> [M, 16]."""
-    x, y, z = np.asarray(directions, np.float64).T
-    xx, yy, zz = x * x, y * y, z * z
-    return np.stack(
-        [
-            np.full_like(x, 0.28209479177387814),
-            -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-            1.0925484305920792 * x * y, -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-            -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        axis=1,
-    )  # fmt: skip
 
 
 def harmonics_rotation(rotation: Array) -> Array:

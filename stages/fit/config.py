@@ -10,10 +10,18 @@ from pipeline.stage import runtime
 from stages.fit.parts.base import Part
 from stages.fit.parts.camera import Background, Exposure, Focal, Poses
 from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
+from stages.fit.parts.detail import Detail
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
 from stages.fit.parts.progressive import Progressive
-from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
+from stages.fit.parts.start import (
+    COARSE_SIDE,
+    Coarse,
+    Filling,
+    Saturation,
+    Shading,
+    coarse_factor,
+)
 from stages.fit.parts.surface import Surface, Warp
 from stages.fit.settings import (
     AUTO,
@@ -30,13 +38,13 @@ from stages.fit.settings import (
 
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
-    Progressive, Filling, Shading, Saturation, Coarse, Exposure, Background, Depth, Flow, Light,
-    Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters,
+    Progressive, Filling, Shading, Saturation, Coarse, Detail, Exposure, Background, Depth, Flow,
+    Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters,
 )  # fmt: skip
 PartName = Literal[
-    "background", "coarse", "density", "depth", "exposure", "filling", "floaters", "flow", "focal",
-    "isotropic", "light", "mcmc", "poses", "progressive", "saturation", "shading", "surface",
-    "variation", "warp",
+    "background", "coarse", "density", "depth", "detail", "exposure", "filling", "floaters", "flow",
+    "focal", "isotropic", "light", "mcmc", "poses", "progressive", "saturation", "shading",
+    "surface", "variation", "warp",
 ]  # fmt: skip
 
 
@@ -47,10 +55,10 @@ class Basics(PartSettings):
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
     bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
     same images and gradients in a first trial)"""
-    iterations: AutoInt = automatic({3: 400, 6: 1000}, held=500, ge=1)
+    iterations: AutoInt = automatic({3: 400, 6: 1000}, held=240, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
-    initial_points: AutoInt = automatic({3: 15000, 6: 30000}, held=60000, ge=4)
+    initial_points: AutoInt = automatic({3: 15000, 6: 30000}, held=30000, ge=4)
     """thin the input points to about this many"""
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """opacity that Gaussians start with (3DGS: 0.1)"""
@@ -68,15 +76,15 @@ class Basics(PartSettings):
     """learning rate of positions at the start, relative to the scene's extent (3DGS: 1.6e-4)"""
     position_lr_final: Positive = 1.6e-5
     """learning rate of positions at the end (3DGS: 1.6e-6)"""
-    feature_lr: AutoFloat = automatic({3: 5e-3, 6: 0.015}, held=0.015)
+    feature_lr: AutoFloat = automatic({3: 5e-3, 6: 0.015}, held=0.04)
     """learning rate of the constant colour (3DGS: 0.0025)"""
-    feature_rest_lr: AutoFloat = automatic({3: 2.5e-4, 6: 7.5e-4, 9: 2e-3}, held=2e-3)
+    feature_rest_lr: AutoFloat = automatic({3: 2.5e-4, 6: 7.5e-4, 9: 2e-3}, held=4e-3)
     """learning rate of the other harmonics (3DGS: 0.000125)"""
     opacity_lr: Weight = 0.05
     """learning rate of opacities"""
-    scaling_lr: AutoFloat = automatic({3: 0.01, 6: 0.03})
+    scaling_lr: AutoFloat = automatic({3: 0.01, 6: 0.03}, held=0.02)
     """learning rate of log scales (3DGS: 0.005)"""
-    rotation_lr: AutoFloat = automatic({3: 2e-3, 6: 6e-3})
+    rotation_lr: AutoFloat = automatic({3: 2e-3, 6: 6e-3}, held=4e-3)
     """learning rate of rotations (3DGS: 0.001)"""
     near: Positive = 0.05
     """near plane, as a share of the scene's median depth"""
@@ -88,9 +96,9 @@ class Basics(PartSettings):
 
 class FitConfig(
     Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings, Density.Settings,
-    Warp.Settings, Surface.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings,
-    Poses.Settings, Coarse.Settings, Variation.Settings, Depth.Settings, Flow.Settings,
-    Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
+    Detail.Settings, Warp.Settings, Surface.Settings, Isotropic.Settings, Focal.Settings,
+    Progressive.Settings, Poses.Settings, Coarse.Settings, Variation.Settings, Depth.Settings,
+    Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 
@@ -146,7 +154,13 @@ class FitSettings(FitConfig):
         return self.model_copy(update=changes)
 
 
-def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) -> FitSettings:
+def resolve(
+    config: FitConfig,
+    views: int,
+    seed: int,
+    held: bool | None = None,
+    long_side: int = 2 * COARSE_SIDE,
+) -> FitSettings:
     """Replace every ``"auto"`` by what it stands for.
 
     Args:
@@ -154,6 +168,7 @@ def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) 
         views: how many are placed.
         seed: of the run.
         held: what ``hold_surface: auto`` comes to; None: no.
+        long_side: of the views, in pixels.
     """
     values = dict(config)
     if values["hold_surface"] == AUTO:
@@ -163,6 +178,8 @@ def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) 
         if values[name] == AUTO and isinstance(rule, dict) and "views" in rule:
             flat = values["hold_surface"] and rule["held"] is not None
             values[name] = rule["held"] if flat else by_rule(rule["views"], views)
+    if values["coarse_factor"] == AUTO:
+        values["coarse_factor"] = coarse_factor(long_side)
     if values["densify_until_iter"] == AUTO:
         values["densify_until_iter"] = max(0, values["iterations"] - SETTLE)
     return FitSettings.model_construct(**values, seed=seed)

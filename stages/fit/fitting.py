@@ -118,7 +118,7 @@ def finished(trainer: Trainer, cameras: Sequence[Camera], frame: Frame) -> Gauss
     light, backdrop = trainer.find(Light), trainer.find(Background)
     if light is not None:
         gaussians = replace(
-            unpack(harmonics_for_viewers(trainer, cameras).packed),
+            unpack(harmonics_for_viewers(trainer, cameras)),
             light=light.light(frame.scale),
         )
     if backdrop is not None and backdrop.values.any():

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import MEASURED
 from pipeline.errors import ReconstructionError
+from stages.fit.arrays import Floats
 from stages.fit.config import FitSettings
-from stages.fit.inputs.initial import facing, headlight_harmonics
+from stages.fit.inputs.initial import SH_C0, facing, headlight_harmonics
 from stages.fit.inputs.scene import Scene
 from stages.fit.numerics.light import prediction_errors
-from stages.fit.parts.camera import Background, Exposure
 from stages.fit.parts.light import Light
-from stages.fit.trainer import Trainer
+from stages.splatting.harmonics import harmonics
 from stages.splatting.kernels.projection import HARMONICS
+
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+#: how much a matte surface counts against one camera, for harmonics of each degree
+MATTE = (1e-3, 0.03, 0.1, 0.3)
 
 
 def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float]]:
@@ -52,12 +59,12 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
     The figures are the PSNR of either on the photograph that was left out.
     """
     held = middle_view(scene.cameras)
-    rest = scene.without(held)
     factor = settings.light_trial_factor
+    rest = scene.reduced(factor).without(held)
     trial = settings.but(
         iterations=settings.light_trial_iterations,
         initial_points=settings.light_trial_points,
-        coarse_fraction=1.0, coarse_factor=factor,
+        coarse_fraction=0.0, detail=False,
         lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False, warp_levels=0,
         opacity_reset_interval=0, sh_degree_interval=0,
     )  # fmt: skip
@@ -85,39 +92,39 @@ def middle_view(cameras: Sequence[Camera]) -> int:
     return int(np.linalg.norm(centres - centres.mean(0), axis=1).argmin())
 
 
-def harmonics_for_viewers(trainer: Trainer, cameras: Sequence[Camera]) -> Trainer:
-    """Spherical harmonics for a lit scene: geometry stays, colours are fitted to the photographs.
+def harmonics_for_viewers(fit: Trainer, cameras: Sequence[Camera]) -> Floats:
+    """A lit scene for viewers that know no light: what it looks like from where photographs are.
+
+    For each Gaussian the harmonics that come nearest to its lit colours at all cameras, and to a
+    matte surface lit from the camera in all that these leave open: a linear problem of its own.
 
     Args:
-        trainer: a finished fit with a light.
+        fit: a finished one with a light.
         cameras: in its frame.
+
+    Returns:
+        [N, 11 + 3 K] packed Gaussians.
     """
-    part, backdrop, s = trainer.find(Light), trainer.find(Background), trainer.settings
-    assert part is not None and backdrop is not None
-    positions = trainer.packed[:, :3].astype(np.float64)
+    part, s = fit.find(Light), fit.settings
+    assert part is not None
+    packed, terms = fit.packed.copy(), (s.sh_degree + 1) ** 2
+    positions = packed[:, :3].astype(np.float64)
     normals = part.normals().astype(np.float64)
     cosine = facing(positions, normals, cameras)
     albedo = np.clip(part.material[:, :3].astype(np.float64), 0, 1.2)
     colours = albedo * (1 - s.headlight + s.headlight * cosine)[:, None]
-    sh = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
-    packed = np.concatenate(
-        [trainer.packed[:, :HARMONICS], sh.reshape(len(sh), -1).astype(np.float32)], 1
-    )
-    colours_only = s.but(
-        iterations=s.light_sh_iterations, coarse_fraction=0.5,
-        feature_rest_lr=s.light_sh_rest_lr, position_lr_init=0.0,
-        position_lr_final=0.0, rotation_lr=0.0, scaling_lr=0.0, opacity_lr=0.0,
-        optimize_poses=False, densify=False, lambda_depth=0.0, lambda_flow=0.0,
-        opacity_reset_interval=0, sh_degree_interval=0,
-        background=tuple(backdrop.values.tolist()),
-    )  # fmt: skip
-    second = Trainer(
-        colours_only, np.ascontiguousarray(packed), trainer.poses.poses, trainer.poses.held,
-        trainer.targets, trainer.extent,
-    )  # fmt: skip
-    first, exposure = trainer.find(Exposure), second.find(Exposure)
-    if first is not None and exposure is not None:
-        exposure.values = first.values
-    second.rasterize = trainer.rasterize
-    second.run(None, lambda *_: None)
-    return second
+    matte = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
+    degrees = np.sqrt(np.arange(terms)).astype(int)
+    trust = np.array(MATTE)[degrees]
+    gram = np.tile(np.diag(trust), (len(packed), 1, 1))
+    wanted = trust[:, None] * matte
+    for view, target in enumerate(fit.targets):
+        viewpoint = fit.viewpoint(view, target[1])
+        part.shade(packed, viewpoint)
+        rays = positions - viewpoint.centre
+        basis = harmonics(rays / np.linalg.norm(rays, axis=1, keepdims=True))[:, :terms]
+        gram += basis[:, :, None] * basis[:, None, :]
+        # the kernels' constant harmonic
+        wanted += basis[:, :, None] * (SH_C0 * packed[:, None, HARMONICS:])
+    sh = np.linalg.solve(gram, wanted)
+    return np.concatenate([packed[:, :HARMONICS], sh.reshape(len(sh), -1).astype(np.float32)], 1)

@@ -40,7 +40,7 @@ def whole_fits() -> None:
         cameras = [_camera(k) for k in range(3)]
         config = FitConfig(
             iterations=8, initial_points=POINTS, light="camera" if held else "none",
-            light_sh_iterations=4, densify=not held, lambda_depth=0.1, hold_colors_until=0.0,
+            densify=not held, lambda_depth=0.1, hold_colors_until=0.0,
             backend="cpu",
         )  # fmt: skip
         fit(

@@ -16,6 +16,7 @@ from stages.fit.config import PARTS, FitSettings
 from stages.fit.inputs.targets import Target
 from stages.fit.parts.base import Part, Step, interpolate, restore_state, state_of
 from stages.fit.parts.camera import PoseOptimizer, SharedFocal
+from stages.fit.parts.start import reduction
 from stages.fit.records import load_checkpoint, save_checkpoint, write_curve, write_preview
 from stages.splatting.adam import Adam
 from stages.splatting.kernels.projection import HARMONICS
@@ -50,7 +51,7 @@ class Trainer:
     kept = (
         "packed", "adam.first", "adam.second", "adam.steps", "poses.poses", "poses.first",
         "poses.second", "poses.steps", "focal.log_factor", "focal.first", "focal.second",
-        "focal.steps", "iteration", "loss", "psnr", "best_loss", "curve",
+        "focal.steps", "iteration", "loss", "psnr", "best_loss", "resized", "curve",
     )  # fmt: skip
 
     def __init__(
@@ -89,6 +90,7 @@ class Trainer:
         self.iteration = 0
         self.loss = self.psnr = 0.0
         self.best_loss = np.inf
+        self.resized = 0
         self.curve: Array = np.empty((0, 4))
         self.fingerprint = self._fingerprint()
         # harmonics still to come are 0, and cost time; frames still to come bring some of their own
@@ -133,7 +135,7 @@ class Trainer:
         self.iteration += 1
         self._use_harmonics()
         s = self.settings
-        factor = s.coarse_factor if self.iteration <= s.coarse_fraction * s.iterations else 1
+        factor = reduction(s, self.iteration)
         target = self.targets[view][factor]
         done = self.iteration / s.iterations
         return Step(view, factor, target, self.viewpoint(view, target), done)
@@ -268,10 +270,11 @@ class Trainer:
     def _check(self) -> None:
         """Raises where the loss has grown beyond what any good moment explains."""
         s = self.settings
-        full_size = int(s.coarse_fraction * s.iterations)
-        # what explains small images perfectly starts anew at full size
-        started = full_size if self.iteration > full_size else 0
-        started = max(started, *(part.latest for part in self.parts))
+        # what explains small images perfectly starts anew at a larger size
+        factor = reduction(s, self.iteration)
+        if factor != reduction(s, max(1, self.iteration - REPORT_EVERY)):
+            self.resized = self.iteration
+        started = max(self.resized, *(part.latest for part in self.parts))
         if self.iteration - started < SETTLED:
             self.best_loss = np.inf
             return

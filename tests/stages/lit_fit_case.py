@@ -78,7 +78,7 @@ def case(lit: bool, shine: float = 1.0) -> tuple[Views, Cameras, Points, Gaussia
 def context(tmp_path, views, cameras, points, threads=2, **config):
     config = {
         "iterations": 150, "initial_points": 2500, "optimize_poses": False, "densify": False,
-        "light_trial_iterations": 40, "light_trial_factor": 2, "light_sh_iterations": 30, **config,
+        "light_trial_iterations": 40, "light_trial_factor": 2, **config,
     }  # fmt: skip
     inputs = {"views": views, "cameras": cameras, "points": points}
     return LocalContext(FitConfig(**config), tmp_path, inputs, threads=threads, seed=3)

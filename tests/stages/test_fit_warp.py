@@ -169,7 +169,7 @@ def test_photographs_bend_a_wrong_surface_back(tmp_path) -> None:
     for levels in (0, 3):
         here = context(
             tmp_path / str(levels), views, few, start, light="camera", hold_surface=True,
-            iterations=300, warp_levels=levels, warp_spacing=0.04, light_sh_iterations=1,
+            iterations=300, warp_levels=levels, warp_spacing=0.04,
         )  # fmt: skip
         FitStage().run(here)
         assert (here.figures.get("surface_bent", 0) > 0.005) == (levels > 0)

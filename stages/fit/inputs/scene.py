@@ -22,6 +22,7 @@ from stages.fit.inputs.initial import (
     thin,
 )
 from stages.fit.inputs.targets import Target, make_pyramids, point_depth
+from stages.fit.parts.start import coarse_factors
 from stages.fit.trainer import Trainer
 
 Flows = dict[int, tuple[int, Floats, Bools]]
@@ -89,6 +90,10 @@ class Scene:
             )
         )
 
+    def reduced(self, factor: int) -> Scene:
+        """With images that are already small."""
+        return replace(self, targets=[{1: target[factor]} for target in self.targets])
+
     def without(self, view: int) -> Scene:
         """All views but one."""
         rest = [index for index in range(len(self.views)) if index != view]
@@ -121,9 +126,7 @@ def prepare(
         )
         cloud, trusted = cloud.select(keep), trusted[keep]
     flows = chosen_flows(views, flow) if settings.lambda_flow > 0 else {}
-    factors = {1}
-    if settings.coarse_fraction > 0 or settings.light != "none":
-        factors.add(settings.coarse_factor)
+    factors = {1, *coarse_factors(settings)}
     if settings.light == "auto":
         factors.add(settings.light_trial_factor)
     targets = make_pyramids(

@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from stages.fit.numerics import (  # noqa: F401
         background,
         density,
+        detail,
         light,
         moments,
         objectives,

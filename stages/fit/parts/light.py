@@ -20,7 +20,6 @@ from stages.fit.settings import (
     PartSettings,
     Share,
     Weight,
-    Whole,
     automatic,
 )
 
@@ -65,9 +64,9 @@ class Light(
         """exponent of the photographs' encoding"""
         # in colour, not in harmonics: C0 times the rate of those. On a held surface neighbours
         # pass on to one another what they are
-        light_albedo_lr: AutoFloat = automatic({3: 1.4e-3, 6: 4.2e-3}, held=5e-3)
+        light_albedo_lr: AutoFloat = automatic({3: 1.4e-3, 6: 4.2e-3}, held=0.03)
         """learning rate of albedos"""
-        light_normal_lr: AutoFloat = automatic({3: 5e-3}, held=2e-3)
+        light_normal_lr: AutoFloat = automatic({3: 5e-3}, held=4e-3)
         """learning rate of the normals that are lit"""
         light_lr: Weight = 1e-2
         """learning rate of logit k and of the lobes' log widths"""
@@ -78,10 +77,6 @@ class Light(
         normals until any strength fits"""
         light_lr_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
         """what the light's, albedos' and normals' rates have fallen to at the end"""
-        light_sh_iterations: Whole = 120
-        """steps at reduced size that fit the spherical harmonics of the .ply to the lit scene"""
-        light_sh_rest_lr: Weight = 5e-3
-        """learning rate of the harmonics above the constant in those steps"""
         light_trial_iterations: Count = 100
         """steps of each trial of light: auto"""
         light_trial_points: Annotated[int, Field(ge=100)] = 6000
@@ -138,7 +133,7 @@ class Light(
         )  # fmt: skip
         gradient[:, 11:14] = 0
         if variation is not None:
-            variation.graph.add(fit.packed[:, :3], self.material, 0, 3, result.material)
+            variation.add(fit, self.material, 0, 3, result.material)
         fall = s.light_lr_decay**step.done
         rates = np.empty(6, np.float32)
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall

@@ -10,12 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from stages.fit import numerics
-from stages.fit.arrays import Bools, Indices
+from stages.fit.arrays import Bools, Floats, Indices
 from stages.fit.parts.base import Figures, Part, Step
 from stages.fit.settings import AutoFloat, PartSettings, Positive, Weight, automatic
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
+
+
+#: what draws neighbours together changes slowly, and costs as much as what is drawn: it has its say
+#: every so many iterations
+TURNS = 4
 
 
 class Depth(Part, switch="lambda_depth", off=0.0):
@@ -90,7 +95,7 @@ class Variation(
     def __init__(self, fit: Trainer) -> None:
         s = fit.settings
         self.graph = numerics.total_variation.TotalVariation(
-            s.lambda_tv, s.tv_neighbours, s.tv_tolerance
+            TURNS * s.lambda_tv, s.tv_neighbours, s.tv_tolerance
         )
 
     def guide(self, fit: Trainer, step: Step) -> None:
@@ -99,9 +104,15 @@ class Variation(
 
         if not fit.lit:
             packed = fit.packed
-            self.graph.add(
-                packed[:, :3], packed, HARMONICS, packed.shape[1], step.gradients.packed, float(C0)
-            )
+            self.add(fit, packed, HARMONICS, packed.shape[1], step.gradients.packed, float(C0))
+
+    def add(
+        self, fit: Trainer, values: Floats, first: int, last: int, gradient: Floats,
+        unit: float = 1.0,
+    ) -> None:  # fmt: skip
+        """As `TotalVariation.add`, every so many iterations and as much heavier."""
+        if fit.iteration % TURNS == 0:
+            self.graph.add(fit.packed[:, :3], values, first, last, gradient, unit)
 
     def select(self, source: Indices, fresh: Bools) -> None:
         self.graph.forget()

@@ -94,6 +94,10 @@ class Surface(
         self.anchor[:, :3] += move
         self.anchor[:, 3:6] = normals
 
+    def shrink(self, rows: Bools, factor: float) -> None:
+        """Gaussians [N] are smaller from now on, in all that they may be."""
+        self.anchor[np.ix_(rows, (6, 8))] += np.float32(np.log(factor))
+
     def select(self, source: Indices, fresh: Bools) -> None:
         self.anchor = np.ascontiguousarray(self.anchor[source])
         self.turn = np.ascontiguousarray(self.turn[source])
@@ -124,9 +128,9 @@ class Warp(
         )
         """no width of splines gets steeper than about this"""
         # on a held surface nothing else moves it
-        warp_lr_init: AutoFloat = automatic({3: 1e-4}, held=3e-4)
+        warp_lr_init: AutoFloat = automatic({3: 1e-4}, held=6e-4)
         """learning rate of the splines at the start, as a share of the scene's depth"""
-        warp_lr_final: AutoFloat = automatic({3: 1e-5}, held=1e-4)
+        warp_lr_final: AutoFloat = automatic({3: 1e-5}, held=2e-4)
         """learning rate of the splines at the end"""
 
     def __init__(self, fit: Trainer) -> None:

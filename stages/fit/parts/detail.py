@@ -1,0 +1,113 @@
+"""Gaussians are split where the photographs show more than they do.
+
+A fit begins with small images and few Gaussians. Each time the images get larger, what is left of
+the error tells where the photographs hold more than these Gaussians can: smooth enamel needs no
+more of them, bark does. So their number follows the content, and most steps are taken with few.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from stages.fit import numerics
+from stages.fit.arrays import Array, Floats
+from stages.fit.parts.base import Figures, Part
+from stages.fit.parts.start import reduction
+from stages.fit.parts.surface import Surface
+from stages.fit.settings import AutoInt, PartSettings, Positive, automatic
+
+if TYPE_CHECKING:
+    from stages.fit.trainer import Trainer
+
+
+class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")):
+    """Attributes:
+    added: Gaussians, so far.
+    """
+
+    class Settings(PartSettings):
+        detail: bool = True
+        """split Gaussians where the photographs show more than they do, each time the images get
+        larger"""
+        detail_gaussians: AutoInt = automatic({3: 60000}, ge=1)
+        """there are no more than so many after it; the largest errors come first"""
+        detail_noise: Annotated[float, Field(ge=0)] = 1.5
+        """an error counts above so many times the photograph's own noise"""
+        detail_error: Annotated[float, Field(ge=0, le=1)] = 0.008
+        """and above this (of 0..1): nobody sees less"""
+        detail_size: Positive = 0.5
+        """Gaussians are split along axes whose standard deviation is more pixels than this"""
+
+    def __init__(self, fit: Trainer) -> None:
+        super().__init__(fit)
+        self.added = 0
+
+    def begin(self, fit: Trainer) -> None:
+        now, after = (reduction(fit.settings, fit.iteration + k) for k in (0, 1))
+        if fit.iteration and after < now:
+            self._split(fit, after)
+
+    def _split(self, fit: Trainer, factor: int) -> None:
+        s: Any = self.settings
+        room = s.detail_gaussians - len(fit.packed)
+        if room <= 0:
+            return
+        excess, area = unexplained(fit, factor, s.detail_noise, s.detail_error)
+        axes = numerics.detail.wide_axes(fit.packed, self._pixel(fit, factor), s.detail_size)
+        wanted = (excess > 0) & (area > 0)
+        axes = numerics.detail.within(axes & wanted[:, None], excess, room)
+        if not axes.any():
+            return
+        packed, source, fresh = numerics.detail.divide(fit.packed, axes)
+        self.added += len(packed) - len(fit.packed)
+        self.latest = fit.iteration
+        fit.replace(packed, source, fresh)
+        surface = fit.find(Surface)
+        if surface is not None:
+            surface.shrink(fresh, numerics.detail.SHRINK)
+
+    def _pixel(self, fit: Trainer, factor: int) -> Floats:
+        """[N] the size of a pixel of the nearest view at a Gaussian, in units of the frame."""
+        pixel = np.full(len(fit.packed), np.inf, np.float32)
+        for view, target in enumerate(fit.targets):
+            viewpoint = fit.viewpoint(view, target[factor])
+            depth = fit.packed[:, :3] @ viewpoint.pose[2, :3] + viewpoint.pose[2, 3]
+            ahead = depth > fit.settings.near
+            size = depth / np.float32(viewpoint.intrinsics[:2].max())
+            pixel = np.where(ahead, np.minimum(pixel, size), pixel)
+        return pixel
+
+    def summary(self) -> Figures:
+        return {"split_for_detail": self.added}
+
+
+def unexplained(fit: Trainer, factor: int, times: float, least: float) -> tuple[Array, Array]:
+    """[N] squared error beyond the photographs' noise that Gaussians colour, and their area.
+
+    Args:
+        fit: as it stands.
+        factor: by which the images are reduced that are compared.
+        times, least: errors count above this many standard deviations of the noise, and above this.
+
+    Returns:
+        Sums over the pixels of all views, weighted by what a Gaussian contributes to each.
+    """
+    excess, area = np.zeros((2, len(fit.packed)))
+    for view, target in enumerate(fit.targets):
+        colour = target[factor].colour
+        rendering = fit.render(view, factor)
+        image = fit.composited(view, rendering)
+        error = colour.target - image
+        # what the camera clipped may be brighter
+        error[(colour.target >= fit.settings.saturation) & (error < 0)] = 0
+        noise = max(times * numerics.detail.noise_level(colour.target, colour.mask), least)
+        planes = np.zeros_like(rendering.planes)
+        planes[0] = colour.mask
+        planes[1] = ((error * error).mean(0) - np.float32(noise * noise)) * colour.mask
+        gradients = rendering.backward(planes, np.zeros_like(rendering.transmittance))
+        area += gradients.features[:, 0]
+        excess += gradients.features[:, 1]
+    return excess, area
