@@ -16,6 +16,7 @@ from stages.stereo.consistency import camera_table, check, stack_depths
 from stages.stereo.fill import complete, distance_to
 from stages.stereo.options import METHODS, DenseOptions, DenseView
 from stages.stereo.polish import polish, source_maps
+from stages.stereo.pyramid import Level, halved, level_count, planes_at
 from stages.stereo.sgbm import ASSUMED_CORRELATION, sgbm_depth
 from stages.stereo.sources import (
     inverse_depth_range,
@@ -24,6 +25,7 @@ from stages.stereo.sources import (
     select_sources,
 )
 from stages.stereo.sweep import cost_volume, plane_homographies, stack_sources
+from stages.stereo.tiles import ranges_around
 
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -110,6 +112,14 @@ def _dense_depths(
         mask & ~bright if options.mask_highlights else mask
         for mask, bright in zip(valid, shiny, strict=True)
     ]
+    pyramids = [
+        [Level(camera, gray, use)] for camera, gray, use in zip(cameras, grays, usable, strict=True)
+    ]
+    if options.method == "sweep":
+        longest = max(max(camera.width, camera.height) for camera in cameras)
+        for levels in pyramids:
+            for _ in range(level_count(longest, options.max_planes)):
+                levels.append(halved(levels[-1]))
     points = scene_points(cameras, sparse)
     everything = np.concatenate(points) if points else np.zeros((0, 3))
     depths, scores = [], []
@@ -119,7 +129,7 @@ def _dense_depths(
             options.best_angle, options.min_angle, options.max_angle,
         )  # fmt: skip
         find = _sweep_view if options.method == "sweep" else _sgbm_view
-        depth, ncc = find(index, chosen, grays, usable, cameras, points[index], everything, options)
+        depth, ncc = find(index, chosen, pyramids, points[index], everything, options)
         keep = valid[index] & (ncc > options.min_ncc)
         depths.append(np.where(keep, depth, 0).astype(np.float32))
         scores.append(ncc)
@@ -137,32 +147,43 @@ def _dense_depths(
 def _sweep_view(
     index: int,
     chosen: list[int],
-    grays: list[Array],
-    usable: list[Mask],
-    cameras: list[Camera],
+    pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
-    """Depth and ZNCC [H, W] of one view, before any check; depth 0 if it has no source."""
-    camera = cameras[index]
+    """Depth and ZNCC [H, W] of one view, before any check; depth 0 if it has no source.
+
+    From coarse to fine: the half-size sweep says between which planes the next one looks.
+    """
+    camera = pyramids[index][0].camera
     if not chosen:
         empty = np.zeros((camera.height, camera.width), np.float32)
         return empty, empty
-    lenses = [cameras[k] for k in chosen]
+    lenses = [pyramids[k][0].camera for k in chosen]
     ends = inverse_depth_range(camera, points, everything, options.range_margin)
     most = min(options.max_planes, max(options.max_volume // (camera.height * camera.width), 16))
     least = min(options.planes, most)
     planes = plane_count(camera, lenses, ends, options.step_px, least, most)
-    inverse = np.linspace(ends[0], ends[1], planes)
-    stack, sizes = stack_sources([grays[k] for k in chosen], [usable[k] for k in chosen])
-    volume = cost_volume(
-        grays[index], usable[index], stack, sizes,
-        plane_homographies(camera, lenses, inverse), options.window, options.min_variance,
-    )  # fmt: skip
-    penalty = edge_aware_penalty(grays[index], options.p2)
-    total = aggregate(volume, penalty, options.p1)
-    plane, ncc, _ = decide(total, volume)
+    levels = level_count(max(camera.width, camera.height), planes)
+    ranges = None
+    for level in range(levels, -1, -1):
+        own, *others = (pyramids[k][level] for k in [index, *chosen])
+        number = planes_at(level, planes)
+        stack, sizes = stack_sources([o.gray for o in others], [o.usable for o in others])
+        homographies = plane_homographies(
+            own.camera, [o.camera for o in others], np.linspace(ends[0], ends[1], number)
+        )
+        volume = cost_volume(
+            own.gray, own.usable, stack, sizes, homographies, options.window,
+            options.min_variance, ranges,
+        )  # fmt: skip
+        penalty = edge_aware_penalty(own.gray, options.p2)
+        plane, ncc, _ = decide(aggregate(volume, penalty, options.p1, ranges), volume, ranges)
+        if level:
+            finer = pyramids[index][level - 1].gray.shape
+            found = plane / np.float32(number - 1)
+            ranges = ranges_around(found, finer, planes_at(level - 1, planes))
     # The first and the last plane stand for all that lies beyond the range.
     ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc).astype(np.float32)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)
@@ -171,7 +192,7 @@ def _sweep_view(
     kept = np.where(ncc > options.min_ncc, depth, 0).astype(np.float32)
     step = (ends[1] - ends[0]) / (planes - 1) / max(float(np.mean(ends)), 1e-12)
     return polish(
-        grays[index], usable[index], stack, sizes, source_maps(camera, lenses), kept, ncc,
+        own.gray, own.usable, stack, sizes, source_maps(camera, lenses), kept, ncc,
         options.polish, options.polish_window, float(step), index,
     )  # fmt: skip
 
@@ -179,22 +200,21 @@ def _sweep_view(
 def _sgbm_view(
     index: int,
     chosen: list[int],
-    grays: list[Array],
-    usable: list[Mask],
-    cameras: list[Camera],
+    pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
     """As `_sweep_view`, from rectified pairs: the median of what the sources say."""
-    camera = cameras[index]
+    own = pyramids[index][0]
+    camera = own.camera
     ends = inverse_depth_range(camera, points, everything, options.range_margin)
     found = [
         sgbm_depth(
-            grays[index], usable[index], camera, grays[k], usable[k], cameras[k],
+            own.gray, own.usable, camera, other.gray, other.usable, other.camera,
             (float(ends[0]), float(ends[1])), options.window,
         )
-        for k in chosen
+        for other in (pyramids[k][0] for k in chosen)
     ]  # fmt: skip
     if not found:
         empty = np.zeros((camera.height, camera.width), np.float32)
