@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.kernels import each, helper, kernel
-from stages.stereo.tiles import TILE, full_ranges
+from stages.stereo.tiles import TILE, Buffer, full_ranges
 
 Array = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
@@ -42,7 +42,7 @@ def _begin(path, low, high):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=True, nogil=True)
 def _horizontal(y, volume, penalty, p1, ranges, tile, total):  # type: ignore[no-untyped-def]
-    """The paths along row y, both ways."""
+    """The paths along row y, both ways; they begin the sum."""
     width, planes = volume.shape[1:]
     rows, columns = tile
     first = y // rows * -(-width // columns)
@@ -64,6 +64,8 @@ def _horizontal(y, volume, penalty, p1, ranges, tile, total):  # type: ignore[no
             if fresh < 2:
                 _begin(current, low, high)
                 fresh += 1
+            if direction == 0:
+                total[y, x, low:high] = 0
             least = _step(
                 volume[y, x, low:high], previous[low : high + 2], least, p1, penalty[y, x],
                 current[low : high + 2], total[y, x, low:high],
@@ -151,7 +153,10 @@ def edge_aware_penalty(gray: Array, p2: float, falloff: float = 20.0) -> Array:
     return (np.float32(p2) / (1 + np.float32(falloff) * np.hypot(gx, gy))).astype(np.float32)
 
 
-def aggregate(volume: Array, penalty: Array, p1: float, ranges: Integers | None = None) -> Array:
+def aggregate(
+    volume: Array, penalty: Array, p1: float, ranges: Integers | None = None,
+    buffer: Buffer | None = None,
+) -> Array:  # fmt: skip
     """Sum of the path costs of a volume.
 
     Args:
@@ -160,11 +165,12 @@ def aggregate(volume: Array, penalty: Array, p1: float, ranges: Integers | None 
         p1: for a change by one plane.
         ranges: [T, 2] int64 first plane and the one after the last of every tile (`tiles`), those
             of `cost_volume`; None: all planes.
+        buffer: where the result goes; None: into memory of its own.
 
     Returns:
         [H, W, D] float32, of use inside the ranges.
     """
-    total = np.zeros_like(volume)
+    total = (buffer or Buffer()).of(volume.shape)
     height, width, planes = volume.shape
     ranges = full_ranges((height, width), planes) if ranges is None else ranges
     each(_horizontal, height, volume, penalty, np.float32(p1), ranges, TILE, total)
@@ -172,7 +178,9 @@ def aggregate(volume: Array, penalty: Array, p1: float, ranges: Integers | None 
     return total
 
 
-def decide(total: Array, volume: Array, ranges: Integers | None = None) -> tuple[Array, Array, Array]:
+def decide(
+    total: Array, volume: Array, ranges: Integers | None = None
+) -> tuple[Array, Array, Array]:
     """Winner takes all, with a parabola through the best plane and its two neighbours.
 
     Args:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.neighbours import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
@@ -25,10 +26,15 @@ from stages.stereo.sources import (
     select_sources,
 )
 from stages.stereo.sweep import cost_volume, plane_homographies, stack_sources
-from stages.stereo.tiles import ranges_around
+from stages.stereo.tiles import Buffer, ranges_around
 
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+
+#: Views that are asked about a depth map: those nearest. All of up to twelve; with more, asking all
+#: would take time that grows with the square of their number.
+MOST_ASKED = 11
 
 #: The completed depth is tried at these shares of the way (in inverse depth) to the far plane.
 _RETREATS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -94,7 +100,11 @@ def complete_depths(
     """
     with kernel_threads(threads):
         grays = [to_gray(image) for image in images]
-        return _finish(depths, confidences, grays, valid, cameras, options)
+        others = [
+            nearest_views(index, cameras, camera.unproject(depth)[depth > 0], MOST_ASKED)
+            for index, (camera, depth) in enumerate(zip(cameras, depths, strict=True))
+        ]
+        return _finish(depths, confidences, grays, valid, cameras, others, options)
 
 
 def _dense_depths(
@@ -122,6 +132,7 @@ def _dense_depths(
                 levels.append(halved(levels[-1]))
     points = scene_points(cameras, sparse)
     everything = np.concatenate(points) if points else np.zeros((0, 3))
+    buffers = Buffer(), Buffer()
     depths, scores = [], []
     for index in range(count):
         chosen = select_sources(
@@ -129,19 +140,22 @@ def _dense_depths(
             options.best_angle, options.min_angle, options.max_angle,
         )  # fmt: skip
         find = _sweep_view if options.method == "sweep" else _sgbm_view
-        depth, ncc = find(index, chosen, pyramids, points[index], everything, options)
+        depth, ncc = find(
+            index, chosen, pyramids, points[index], everything, buffers, options
+        )  # fmt: skip
         keep = valid[index] & (ncc > options.min_ncc)
         depths.append(np.where(keep, depth, 0).astype(np.float32))
         scores.append(ncc)
         progress(index + 1, count)
-    depths, agreeing, angles = _consistent(depths, scores, cameras, options)
+    others = [nearest_views(k, cameras, points[k], MOST_ASKED) for k in range(count)]
+    depths, agreeing, angles = _consistent(depths, scores, cameras, others, options)
     confidences = [
         confidence_of(depth, score, number, angle, bright)
         for depth, score, number, angle, bright in zip(
             depths, scores, agreeing, angles, shiny, strict=True
         )
     ]
-    return _finish(depths, confidences, grays, valid, cameras, options)
+    return _finish(depths, confidences, grays, valid, cameras, others, options)
 
 
 def _sweep_view(
@@ -150,6 +164,7 @@ def _sweep_view(
     pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
+    buffers: tuple[Buffer, Buffer],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
     """Depth and ZNCC [H, W] of one view, before any check; depth 0 if it has no source.
@@ -176,10 +191,11 @@ def _sweep_view(
         )
         volume = cost_volume(
             own.gray, own.usable, stack, sizes, homographies, options.window,
-            options.min_variance, ranges,
+            options.min_variance, ranges, buffers[0],
         )  # fmt: skip
         penalty = edge_aware_penalty(own.gray, options.p2)
-        plane, ncc, _ = decide(aggregate(volume, penalty, options.p1, ranges), volume, ranges)
+        total = aggregate(volume, penalty, options.p1, ranges, buffers[1])
+        plane, ncc, _ = decide(total, volume, ranges)
         if level:
             finer = pyramids[index][level - 1].gray.shape
             found = plane / np.float32(number - 1)
@@ -203,6 +219,7 @@ def _sgbm_view(
     pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
+    buffers: tuple[Buffer, Buffer],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
     """As `_sweep_view`, from rectified pairs: the median of what the sources say."""
@@ -230,8 +247,9 @@ def _sgbm_view(
 
 
 def _consistent(
-    depths: list[Array], scores: list[Array], cameras: list[Camera], options: DenseOptions
-) -> tuple[list[Array], list[npt.NDArray[np.int32]], list[Array]]:
+    depths: list[Array], scores: list[Array], cameras: list[Camera], others: list[Integers],
+    options: DenseOptions,
+) -> tuple[list[Array], list[npt.NDArray[np.int32]], list[Array]]:  # fmt: skip
     """Keep what enough other views agree with, averaged with what they say."""
     # What is wrong finds a second witness easily where there are many.
     needed = options.min_agreeing or 1 + (len(depths) >= 6) + (len(depths) >= 12)
@@ -243,7 +261,7 @@ def _consistent(
     for index, depth in enumerate(depths):
         agree, conflict, fused, angle = check(
             index, stack, weights, table, depth.shape,
-            options.relative_depth, options.reprojection_px, options.front,
+            options.relative_depth, options.reprojection_px, options.front, others[index],
         )  # fmt: skip
         good = (agree >= needed) & (agree >= conflict)
         good &= large_islands(fused, good, options.speckle, 2 * options.relative_depth)
@@ -313,6 +331,7 @@ def _finish(
     grays: list[Array],
     valid: list[Mask],
     cameras: list[Camera],
+    others: list[Integers],
     options: DenseOptions,
 ) -> list[DenseView]:
     """Complete every view and add normals."""
@@ -323,7 +342,7 @@ def _finish(
         known = depth > 0
         filled = np.zeros_like(depth)
         if options.fill and known.any():
-            filled = _fill(index, stack, table, grays[index], confidence, options)
+            filled = _fill(index, stack, table, grays[index], confidence, others[index], options)
             filled = np.where(valid[index], filled, 0).astype(np.float32)
             trust = 1.01 + 0.19 * np.exp(-distance_to(known) / 20)
             confidence = np.where(known | (filled <= 0), confidence, trust).astype(np.float32)
@@ -340,11 +359,12 @@ def _fill(
     table: npt.NDArray[np.float64],
     gray: Array,
     confidence: Array,
+    others: Integers,
     options: DenseOptions,
 ) -> Array:
     """Completed depth [H, W] of a view, 0 where it would hide what another view sees."""
     height, width = gray.shape
-    depth = stack[index, :height, :width]
+    depth = stack[index, :height, :width].copy()
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
     far = 0.85 * float(np.percentile(inverse[known], 1))
@@ -352,19 +372,20 @@ def _fill(
     smooth = complete(inverse, weight, gray, far, options.fill_reach_px)
     result = depth.copy()
     open_pixels = ~known
-    weights = np.ones_like(stack)
+    weights = np.broadcast_to(np.float32(1), stack.shape)
     for retreat in _RETREATS:
         trial = 1 / ((1 - retreat) * smooth + retreat * np.float32(far))
-        probe = stack.copy()
-        probe[index] = 0
-        probe[index, :height, :width] = np.where(open_pixels, trial, 0)
+        stack[index] = 0
+        stack[index, :height, :width] = np.where(open_pixels, trial, 0)
         _, conflict, _, _ = check(
-            index, probe, weights, table, (height, width),
-            options.relative_depth, options.reprojection_px, options.front,
+            index, stack, weights, table, (height, width),
+            options.relative_depth, options.reprojection_px, options.front, others,
         )  # fmt: skip
         accept = open_pixels & (conflict == 0)
         result[accept] = trial[accept]
         open_pixels &= ~accept
         if not open_pixels.any():
             break
+    stack[index] = 0
+    stack[index, :height, :width] = depth
     return result

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.kernels import each, helper, kernel
-from stages.stereo.tiles import TILE, full_ranges, tile_grid
+from stages.stereo.tiles import TILE, Buffer, full_ranges, tile_grid
 
 Array = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
@@ -102,9 +102,9 @@ def _warp(source, height, width, h, xs, ys, where, across, down, inside, out):  
         where[k] = i * stride + j
     flat = source.reshape(-1)
     for k in range(out.shape[0]):
-        i = np.uint64(where[k])  # unsigned: a signed index is asked whether it counts from the end
-        under = i + np.uint64(stride)
-        top = flat[i] + (flat[i + np.uint64(1)] - flat[i]) * across[k]
+        at = np.uint64(where[k])  # unsigned: a signed index is asked whether it counts from the end
+        under = at + np.uint64(stride)
+        top = flat[at] + (flat[at + np.uint64(1)] - flat[at]) * across[k]
         low = flat[under] + (flat[under + np.uint64(1)] - flat[under]) * across[k]
         out[k] = top + (low - top) * down[k] if inside[k] >= zero else UNUSABLE
 
@@ -241,6 +241,7 @@ def cost_volume(
     window: int,
     var_min: float = 2e-5,
     ranges: Integers | None = None,
+    buffer: Buffer | None = None,
 ) -> Array:
     """Matching cost of every pixel at every plane: 1 - ZNCC, averaged over the best sources.
 
@@ -258,12 +259,13 @@ def cost_volume(
         var_min: least variance in the denominator, so that noise does not correlate.
         ranges: [T, 2] int64 for every tile (row by row) its first plane and the one after its
             last; None: all planes. Outside of them the volume holds anything.
+        buffer: where the volume goes; None: into memory of its own.
 
     Returns:
         [H, W, D] float32 in 0..1.2; `NEUTRAL_COST` where no source can be compared.
     """
     height, width = reference.shape
-    volume = np.empty((height, width, len(homographies)), np.float32)
+    volume = (buffer or Buffer()).of((height, width, len(homographies)))
     down, across = tile_grid(reference.shape)
     each(
         _sweep_tile, down * across, across, np.ascontiguousarray(reference, np.float32),

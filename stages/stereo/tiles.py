@@ -19,6 +19,20 @@ MARGIN = 4
 RING = 2
 
 
+class Buffer:
+    """Memory for one volume after the other: fresh pages cost as much as the work done in them."""
+
+    def __init__(self) -> None:
+        self._values = np.empty(0, np.float32)
+
+    def of(self, shape: tuple[int, ...]) -> Array:
+        """An array of this shape, float32, that holds anything; it ends the one before."""
+        size = int(np.prod(shape))
+        if size > len(self._values):
+            self._values = np.empty(size, np.float32)
+        return self._values[:size].reshape(shape)
+
+
 def tile_grid(shape: tuple[int, int]) -> tuple[int, int]:
     """Rows and columns of the tiles that cover an image [H, W]."""
     return -(-shape[0] // TILE[0]), -(-shape[1] // TILE[1])

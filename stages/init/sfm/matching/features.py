@@ -42,6 +42,16 @@ class Features:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def plain(self) -> Features:
+        """Those of the image itself; they must come first, so that indices stay the same."""
+        count = int((self.squeezes == 1).sum())
+        if count in (0, len(self)) or (self.squeezes[:count] != 1).any():
+            return self
+        return Features(
+            self.positions[:count], self.descriptors[:count], self.scales[:count],
+            self.squeezes[:count], self.points[:count], self.roll,
+        )  # fmt: skip
+
     def largest(self, count: int) -> npt.NDArray[np.int64]:
         """[<= count] indices of the unsqueezed keypoints of the largest scale, largest first."""
         plain = np.flatnonzero(self.squeezes == 1)
@@ -175,16 +185,29 @@ def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArr
     around it.
     """
     leader = np.full(len(positions), -1, np.int64)
-    if not len(positions):
-        return leader
-    around = cKDTree(positions).query_ball_point(positions, radius, return_sorted=True)
-    for index, neighbours in enumerate(around):
-        if leader[index] >= 0:
-            continue
-        for neighbour in neighbours:
-            if leader[neighbour] < 0:
-                leader[neighbour] = index
-    return leader
+    if len(positions) < 2:
+        return np.arange(len(positions))
+    near = cKDTree(positions).query_pairs(radius, output_type="ndarray")
+    near = near[np.lexsort((near[:, 1], near[:, 0]))]
+    for first, second in near.tolist():
+        if leader[first] < 0:
+            leader[first] = first
+        if leader[first] == first and leader[second] < 0:
+            leader[second] = first
+    return np.where(leader < 0, np.arange(len(positions)), leader)
+
+
+def joined(first: Features, second: Features, merge_radius: float) -> Features:
+    """The features of one view with further ones behind them; those keep their indices."""
+    positions = np.concatenate([first.positions, second.positions])
+    return Features(
+        positions=positions,
+        descriptors=np.concatenate([first.descriptors, second.descriptors]),
+        scales=np.concatenate([first.scales, second.scales]),
+        squeezes=np.concatenate([first.squeezes, second.squeezes]),
+        points=merge_points(positions, merge_radius),
+        roll=first.roll,
+    )
 
 
 def _sift(
