@@ -13,7 +13,13 @@ from threadpoolctl import threadpool_limits
 from pipeline.geometry.graph import Pair
 from stages.init.parallel import in_threads
 from stages.init.sfm.mapping import MappingInput, Solution
-from stages.init.sfm.matching.features import Features, detect_features, joined
+from stages.init.sfm.matching.features import (
+    Features,
+    copies_of,
+    describe,
+    detect_features,
+    joined,
+)
 from stages.init.sfm.matching.match import (
     candidate_pairs,
     match_features,
@@ -130,7 +136,7 @@ def reconstruct(
 
         plain = tuple(squeeze for squeeze in options.squeezes if squeeze == 1) or options.squeezes
         first = replace(options, squeezes=plain)
-        features = find_features(grays, valid, first, threads, progress, rolls)
+        features = find_features(grays, valid, first, threads, progress, rolls, scratch)
         counts = overlaps(features, ordered, options)
         near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
         found = match_pairs(features, near, options, pixel, threads, progress)
@@ -144,6 +150,7 @@ def reconstruct(
         more = find_features(
             [grays[view] for view in turned], [valid[view] for view in turned],
             replace(options, squeezes=copies), threads, progress, [rolls[view] for view in turned],
+            scratch,
         )  # fmt: skip
         for view, others in zip(turned, more, strict=True):
             features[view] = joined(features[view], others, options.merge_radius)
@@ -231,20 +238,31 @@ def find_features(
     threads: int,
     progress: Progress,
     rolls: list[float] | None = None,
+    scratch: Path | None = None,
 ) -> list[Features]:
     """The features of all views; `rolls` are their rolls in degrees, if any is known."""
-
-    def detect(view: int) -> Features:
-        return detect_features(
-            grays[view], valid[view],
-            squeezes=options.squeezes, upright=options.upright,
-            peak_threshold=options.peak_threshold, max_features=options.max_features,
-            merge_radius=options.merge_radius, roll=rolls[view] if rolls else 0.0,
-        )  # fmt: skip
-
-    return in_threads(
-        detect, range(len(grays)), threads, lambda done: progress("features", done, len(grays))
-    )
+    rolls = rolls or [0.0] * len(grays)
+    count = len(options.squeezes)
+    features: list[Features] = []
+    # A few views at a time, so that one sees how it goes on.
+    for start in range(0, len(grays), 2 * threads):
+        views = range(start, min(start + 2 * threads, len(grays)))
+        copies = [
+            copy for view in views for copy in copies_of(grays[view], options.squeezes, rolls[view])
+        ]
+        found = describe(
+            copies, options.upright, options.peak_threshold, options.max_features, threads, scratch
+        )
+        for number, view in enumerate(views):
+            features.append(
+                detect_features(
+                    grays[view], valid[view],
+                    squeezes=options.squeezes, merge_radius=options.merge_radius, roll=rolls[view],
+                    described=found[number * count : (number + 1) * count],
+                )
+            )  # fmt: skip
+        progress("features", len(features), len(grays))
+    return features
 
 
 def match_views(
