@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
+from pipeline.geometry.neighbours import nearest_views
 from pipeline.geometry.normals import depth_normals
 from pipeline.kernels import each, kernel, kernel_threads
 
@@ -17,6 +18,9 @@ Array = npt.NDArray[np.float32]
 
 #: Sum of the three channels by which views may differ in the colour of the same surface.
 _ALIKE = np.float32(0.3)
+#: Views that are asked about a depth map: those nearest. With more, asking all would take time that
+#: grows with the square of their number.
+MOST_ASKED = 11
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,12 @@ class FusedCloud:
 
 @kernel(nogil=True)
 def _fuse_row(  # type: ignore[no-untyped-def]
-    y, index, depths, confidences, images, cameras, fill_confidence, relative, front,
+    y, index, others, depths, confidences, images, cameras, fill_confidence, relative, front,
     min_agreeing, merge, keep, depth_out, color_out, residual_out,
 ):  # fmt: skip
     """`fuse` for one row of one view."""
     here = cameras[index]
-    views = depths.shape[0]
+    views = len(others) + 1
     colors = np.empty((views, 3), np.float32)
     lumas = np.empty(views, np.float32)
     weights = np.empty(views, np.float32)
@@ -97,9 +101,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
         agree = 0
         refuted = 0
         explained = False
-        for v in range(views):
-            if v == index:
-                continue
+        for v in others:
             there = cameras[v]
             zv = there[12] * X + there[13] * Y + there[14] * Z + there[17]
             if zv <= 1e-9:
@@ -224,12 +226,14 @@ def fuse(
     with kernel_threads(threads):
         for v, camera in enumerate(cameras):
             shape = depths[v].shape
+            seen = camera.unproject(depths[v])[confidences[v] > 1]
+            others = nearest_views(v, list(cameras), seen, MOST_ASKED)
             keep = np.zeros(shape, np.uint8)
             depth = np.zeros(shape, np.float32)
             color = np.zeros((*shape, 3), np.float32)
             residual = np.full(shape, -1, np.float32)
             each(
-                _fuse_row, shape[0], v, depth_stack, confidence_stack, image_stack, table,
+                _fuse_row, shape[0], v, others, depth_stack, confidence_stack, image_stack, table,
                 np.float32(options.fill_confidence), float(options.relative_depth),
                 float(options.front), int(options.min_agreeing), bool(options.merge),
                 keep, depth, color, residual,

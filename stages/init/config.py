@@ -298,7 +298,8 @@ class InitConfig(StageConfig):
     )
     squeezes: tuple[float, ...] = Field(
         (1.0, 0.71, 0.5), min_length=1, max_length=8,
-        description="horizontally squeezed copies of the image that features are taken from",
+        description="horizontally squeezed copies of the image that features are taken from; but "
+        "1 only where a view is linked to less than two others without them",
     )  # fmt: skip
     upright: bool = Field(True, description="features without orientation: photos not rolled")
     peak_threshold: float = Field(0.002, gt=0, le=0.1, description="SIFT contrast threshold")

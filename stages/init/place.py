@@ -136,6 +136,7 @@ def _straight(view: View, focal: float, k1: float) -> View:
 def place_known(
     views: list[View], known: dict[str, KnownCamera], units: str, ordered: bool,
     options: ClassicalOptions, *, threads: int, progress: Progress, warn: Warn,
+    scratch: Path | None = None,
 ) -> Placement:  # fmt: skip
     """The cameras that the user gave; only the points are found.
 
@@ -144,6 +145,7 @@ def place_known(
     Args:
         known: name of a view -> its camera.
         units: of the world of these cameras.
+        scratch: folder for files that are needed meanwhile; None: the system's.
 
     Raises:
         ReconstructionError: too few matches agree with the cameras to tell where the scene is.
@@ -155,7 +157,7 @@ def place_known(
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
     features = find_features(
         [view.gray() for view in placed], [view.valid() for view in placed], options, threads,
-        progress,
+        progress, scratch=scratch,
     )  # fmt: skip
     pixel = max(max(view.width, view.height) for view in placed) / REFERENCE_SIDE
     matches = match_views(features, ordered, options, pixel, threads, progress)

@@ -35,6 +35,6 @@ def everything() -> None:
         decide(aggregate(volume, even, 0.1), volume)
         check(
             0, depths, depths, np.array([camera] * VIEWS, np.float64), (HEIGHT, WIDTH),
-            0.01, 1.0, 0.02,
+            0.01, 1.0, 0.02, np.array([1]),
         )  # fmt: skip
         complete(even, even, gray, 1.0)

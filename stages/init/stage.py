@@ -28,7 +28,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 8
+    version = 9
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -284,7 +284,7 @@ def _from_known_cameras(context: StageContext, views: Views) -> None:
     placement = place_known(
         list(views.views), known, units, views.ordered,
         _classical_options(config), threads=context.threads, progress=context.progress,
-        warn=context.warn,
+        warn=context.warn, scratch=context.scratch,
     )  # fmt: skip
     densify(context, views, placement.normalised())
 

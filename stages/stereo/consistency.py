@@ -60,11 +60,11 @@ def _drop(c, X, Y, Z):  # type: ignore[no-untyped-def]
 
 @kernel(nogil=True)
 def _check_row(  # type: ignore[no-untyped-def]
-    y, index, depths, weights, cameras, relative, pixels, front, agree, conflict, fused, angle
-):
+    y, index, others, depths, weights, cameras, relative, pixels, front, agree, conflict, fused,
+    angle,
+):  # fmt: skip
     """One row of `check`."""
     here = cameras[index]
-    views = depths.shape[0]
     for x in range(agree.shape[1]):
         z = np.float64(depths[index, y, x])
         if z <= 0:
@@ -77,9 +77,7 @@ def _check_row(  # type: ignore[no-untyped-def]
         oz = Z + here[8] * here[15] + here[11] * here[16] + here[14] * here[17]
         length = np.sqrt(ox * ox + oy * oy + oz * oz)
         widest = 0.0
-        for v in range(views):
-            if v == index:
-                continue
+        for v in others:
             there = cameras[v]
             u, w, zv = _drop(there, X, Y, Z)
             if zv <= 0:
@@ -126,8 +124,9 @@ def check(
     relative: float,
     pixels: float,
     front: float,
+    others: npt.NDArray[np.int64],
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], Array, Array]:
-    """Ask all other views about the depth map of one.
+    """Ask other views about the depth map of one.
 
     Args:
         index: the view in question.
@@ -138,6 +137,7 @@ def check(
         relative: largest relative difference of depth that agrees.
         pixels: largest reprojection error in pixels that agrees.
         front: a depth that lies by this share in front of what another view sees is refuted.
+        others: [K] int64, the views to ask.
 
     Returns:
         Agreeing views [H, W] int32; refuting views [H, W] int32; mean depth of the view and those
@@ -148,7 +148,7 @@ def check(
     fused = np.zeros(shape, np.float32)
     angle = np.zeros(shape, np.float32)
     each(
-        _check_row, shape[0], int(index), depths, weights, cameras, float(relative),
+        _check_row, shape[0], int(index), others, depths, weights, cameras, float(relative),
         float(pixels), float(front), agree, conflict, fused, angle,
     )  # fmt: skip
     return agree, conflict, fused, angle

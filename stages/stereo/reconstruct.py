@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.geometry.neighbours import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
@@ -16,6 +17,7 @@ from stages.stereo.consistency import camera_table, check, stack_depths
 from stages.stereo.fill import complete, distance_to
 from stages.stereo.options import METHODS, DenseOptions, DenseView
 from stages.stereo.polish import polish, source_maps
+from stages.stereo.pyramid import Level, halved, level_count, planes_at
 from stages.stereo.sgbm import ASSUMED_CORRELATION, sgbm_depth
 from stages.stereo.sources import (
     inverse_depth_range,
@@ -24,9 +26,15 @@ from stages.stereo.sources import (
     select_sources,
 )
 from stages.stereo.sweep import cost_volume, plane_homographies, stack_sources
+from stages.stereo.tiles import Buffer, ranges_around
 
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+
+#: Views that are asked about a depth map: those nearest. All of up to twelve; with more, asking all
+#: would take time that grows with the square of their number.
+MOST_ASKED = 11
 
 #: The completed depth is tried at these shares of the way (in inverse depth) to the far plane.
 _RETREATS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -92,7 +100,11 @@ def complete_depths(
     """
     with kernel_threads(threads):
         grays = [to_gray(image) for image in images]
-        return _finish(depths, confidences, grays, valid, cameras, options)
+        others = [
+            nearest_views(index, cameras, camera.unproject(depth)[depth > 0], MOST_ASKED)
+            for index, (camera, depth) in enumerate(zip(cameras, depths, strict=True))
+        ]
+        return _finish(depths, confidences, grays, valid, cameras, others, options)
 
 
 def _dense_depths(
@@ -110,8 +122,17 @@ def _dense_depths(
         mask & ~bright if options.mask_highlights else mask
         for mask, bright in zip(valid, shiny, strict=True)
     ]
+    pyramids = [
+        [Level(camera, gray, use)] for camera, gray, use in zip(cameras, grays, usable, strict=True)
+    ]
+    if options.method == "sweep":
+        longest = max(max(camera.width, camera.height) for camera in cameras)
+        for levels in pyramids:
+            for _ in range(level_count(longest, options.max_planes)):
+                levels.append(halved(levels[-1]))
     points = scene_points(cameras, sparse)
     everything = np.concatenate(points) if points else np.zeros((0, 3))
+    buffers = Buffer(), Buffer()
     depths, scores = [], []
     for index in range(count):
         chosen = select_sources(
@@ -119,50 +140,66 @@ def _dense_depths(
             options.best_angle, options.min_angle, options.max_angle,
         )  # fmt: skip
         find = _sweep_view if options.method == "sweep" else _sgbm_view
-        depth, ncc = find(index, chosen, grays, usable, cameras, points[index], everything, options)
+        depth, ncc = find(
+            index, chosen, pyramids, points[index], everything, buffers, options
+        )  # fmt: skip
         keep = valid[index] & (ncc > options.min_ncc)
         depths.append(np.where(keep, depth, 0).astype(np.float32))
         scores.append(ncc)
         progress(index + 1, count)
-    depths, agreeing, angles = _consistent(depths, scores, cameras, options)
+    others = [nearest_views(k, cameras, points[k], MOST_ASKED) for k in range(count)]
+    depths, agreeing, angles = _consistent(depths, scores, cameras, others, options)
     confidences = [
         confidence_of(depth, score, number, angle, bright)
         for depth, score, number, angle, bright in zip(
             depths, scores, agreeing, angles, shiny, strict=True
         )
     ]
-    return _finish(depths, confidences, grays, valid, cameras, options)
+    return _finish(depths, confidences, grays, valid, cameras, others, options)
 
 
 def _sweep_view(
     index: int,
     chosen: list[int],
-    grays: list[Array],
-    usable: list[Mask],
-    cameras: list[Camera],
+    pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
+    buffers: tuple[Buffer, Buffer],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
-    """Depth and ZNCC [H, W] of one view, before any check; depth 0 if it has no source."""
-    camera = cameras[index]
+    """Depth and ZNCC [H, W] of one view, before any check; depth 0 if it has no source.
+
+    From coarse to fine: the half-size sweep says between which planes the next one looks.
+    """
+    camera = pyramids[index][0].camera
     if not chosen:
         empty = np.zeros((camera.height, camera.width), np.float32)
         return empty, empty
-    lenses = [cameras[k] for k in chosen]
+    lenses = [pyramids[k][0].camera for k in chosen]
     ends = inverse_depth_range(camera, points, everything, options.range_margin)
     most = min(options.max_planes, max(options.max_volume // (camera.height * camera.width), 16))
     least = min(options.planes, most)
     planes = plane_count(camera, lenses, ends, options.step_px, least, most)
-    inverse = np.linspace(ends[0], ends[1], planes)
-    stack, sizes = stack_sources([grays[k] for k in chosen], [usable[k] for k in chosen])
-    volume = cost_volume(
-        grays[index], usable[index], stack, sizes,
-        plane_homographies(camera, lenses, inverse), options.window, options.min_variance,
-    )  # fmt: skip
-    penalty = edge_aware_penalty(grays[index], options.p2)
-    total = aggregate(volume, penalty, options.p1)
-    plane, ncc, _ = decide(total, volume)
+    levels = level_count(max(camera.width, camera.height), planes)
+    ranges = None
+    for level in range(levels, -1, -1):
+        own, *others = (pyramids[k][level] for k in [index, *chosen])
+        number = planes_at(level, planes)
+        stack, sizes = stack_sources([o.gray for o in others], [o.usable for o in others])
+        homographies = plane_homographies(
+            own.camera, [o.camera for o in others], np.linspace(ends[0], ends[1], number)
+        )
+        volume = cost_volume(
+            own.gray, own.usable, stack, sizes, homographies, options.window,
+            options.min_variance, ranges, buffers[0],
+        )  # fmt: skip
+        penalty = edge_aware_penalty(own.gray, options.p2)
+        total = aggregate(volume, penalty, options.p1, ranges, buffers[1])
+        plane, ncc, _ = decide(total, volume, ranges)
+        if level:
+            finer = pyramids[index][level - 1].gray.shape
+            found = plane / np.float32(number - 1)
+            ranges = ranges_around(found, finer, planes_at(level - 1, planes))
     # The first and the last plane stand for all that lies beyond the range.
     ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc).astype(np.float32)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)
@@ -171,7 +208,7 @@ def _sweep_view(
     kept = np.where(ncc > options.min_ncc, depth, 0).astype(np.float32)
     step = (ends[1] - ends[0]) / (planes - 1) / max(float(np.mean(ends)), 1e-12)
     return polish(
-        grays[index], usable[index], stack, sizes, source_maps(camera, lenses), kept, ncc,
+        own.gray, own.usable, stack, sizes, source_maps(camera, lenses), kept, ncc,
         options.polish, options.polish_window, float(step), index,
     )  # fmt: skip
 
@@ -179,22 +216,22 @@ def _sweep_view(
 def _sgbm_view(
     index: int,
     chosen: list[int],
-    grays: list[Array],
-    usable: list[Mask],
-    cameras: list[Camera],
+    pyramids: list[list[Level]],
     points: npt.NDArray[np.float64],
     everything: npt.NDArray[np.float64],
+    buffers: tuple[Buffer, Buffer],
     options: DenseOptions,
 ) -> tuple[Array, Array]:
     """As `_sweep_view`, from rectified pairs: the median of what the sources say."""
-    camera = cameras[index]
+    own = pyramids[index][0]
+    camera = own.camera
     ends = inverse_depth_range(camera, points, everything, options.range_margin)
     found = [
         sgbm_depth(
-            grays[index], usable[index], camera, grays[k], usable[k], cameras[k],
+            own.gray, own.usable, camera, other.gray, other.usable, other.camera,
             (float(ends[0]), float(ends[1])), options.window,
         )
-        for k in chosen
+        for other in (pyramids[k][0] for k in chosen)
     ]  # fmt: skip
     if not found:
         empty = np.zeros((camera.height, camera.width), np.float32)
@@ -210,8 +247,9 @@ def _sgbm_view(
 
 
 def _consistent(
-    depths: list[Array], scores: list[Array], cameras: list[Camera], options: DenseOptions
-) -> tuple[list[Array], list[npt.NDArray[np.int32]], list[Array]]:
+    depths: list[Array], scores: list[Array], cameras: list[Camera], others: list[Integers],
+    options: DenseOptions,
+) -> tuple[list[Array], list[npt.NDArray[np.int32]], list[Array]]:  # fmt: skip
     """Keep what enough other views agree with, averaged with what they say."""
     # What is wrong finds a second witness easily where there are many.
     needed = options.min_agreeing or 1 + (len(depths) >= 6) + (len(depths) >= 12)
@@ -223,7 +261,7 @@ def _consistent(
     for index, depth in enumerate(depths):
         agree, conflict, fused, angle = check(
             index, stack, weights, table, depth.shape,
-            options.relative_depth, options.reprojection_px, options.front,
+            options.relative_depth, options.reprojection_px, options.front, others[index],
         )  # fmt: skip
         good = (agree >= needed) & (agree >= conflict)
         good &= large_islands(fused, good, options.speckle, 2 * options.relative_depth)
@@ -293,6 +331,7 @@ def _finish(
     grays: list[Array],
     valid: list[Mask],
     cameras: list[Camera],
+    others: list[Integers],
     options: DenseOptions,
 ) -> list[DenseView]:
     """Complete every view and add normals."""
@@ -303,7 +342,7 @@ def _finish(
         known = depth > 0
         filled = np.zeros_like(depth)
         if options.fill and known.any():
-            filled = _fill(index, stack, table, grays[index], confidence, options)
+            filled = _fill(index, stack, table, grays[index], confidence, others[index], options)
             filled = np.where(valid[index], filled, 0).astype(np.float32)
             trust = 1.01 + 0.19 * np.exp(-distance_to(known) / 20)
             confidence = np.where(known | (filled <= 0), confidence, trust).astype(np.float32)
@@ -320,11 +359,12 @@ def _fill(
     table: npt.NDArray[np.float64],
     gray: Array,
     confidence: Array,
+    others: Integers,
     options: DenseOptions,
 ) -> Array:
     """Completed depth [H, W] of a view, 0 where it would hide what another view sees."""
     height, width = gray.shape
-    depth = stack[index, :height, :width]
+    depth = stack[index, :height, :width].copy()
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
     far = 0.85 * float(np.percentile(inverse[known], 1))
@@ -332,19 +372,20 @@ def _fill(
     smooth = complete(inverse, weight, gray, far, options.fill_reach_px)
     result = depth.copy()
     open_pixels = ~known
-    weights = np.ones_like(stack)
+    weights = np.broadcast_to(np.float32(1), stack.shape)
     for retreat in _RETREATS:
         trial = 1 / ((1 - retreat) * smooth + retreat * np.float32(far))
-        probe = stack.copy()
-        probe[index] = 0
-        probe[index, :height, :width] = np.where(open_pixels, trial, 0)
+        stack[index] = 0
+        stack[index, :height, :width] = np.where(open_pixels, trial, 0)
         _, conflict, _, _ = check(
-            index, probe, weights, table, (height, width),
-            options.relative_depth, options.reprojection_px, options.front,
+            index, stack, weights, table, (height, width),
+            options.relative_depth, options.reprojection_px, options.front, others,
         )  # fmt: skip
         accept = open_pixels & (conflict == 0)
         result[accept] = trial[accept]
         open_pixels &= ~accept
         if not open_pixels.any():
             break
+    stack[index] = 0
+    stack[index, :height, :width] = depth
     return result

@@ -12,16 +12,19 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.kernels import each, helper, kernel
+from stages.stereo.tiles import TILE, Buffer, full_ranges, tile_grid
 
 Array = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int64]
 
 #: Value of a source pixel that must not be used: so low that any share of it in a bilinear sample
 #: makes the sample negative.
 UNUSABLE = np.float32(-1e6)
 #: Cost where nothing can be compared: that of no correlation, so that it prefers no depth.
 NEUTRAL_COST = np.float32(1.0)
-#: Rows that one task sweeps: its part of the cost volume stays in the cache.
-_BAND = 16
+#: Cost of a source that can't be compared: above all that can (1.2).
+_UNSEEN = np.float32(2)
+_ROWS, _COLUMNS = TILE
 
 
 def plane_homographies(
@@ -69,133 +72,164 @@ def stack_sources(images: list[Array], usable: list[npt.NDArray[np.bool_]]) -> t
 
 
 @helper(fastmath=True)
-def _warp_row(source, height, width, h, y, x0, row):  # type: ignore[no-untyped-def]
-    """Sample a source [H, W] bilinearly along reference row y, columns x0, x0 + 1, ..."""
-    v0 = h[1] * y + h[2]
-    v1 = h[4] * y + h[5]
-    v2 = h[7] * y + h[8]
+def _warp(source, height, width, h, xs, ys, where, across, down, inside, out):  # type: ignore[no-untyped-def]
+    """Sample a source [H, W] bilinearly where the reference pixels (xs, ys) are seen in it.
+
+    In two loops, as one would not be vectorised: `where` gets the index of the pixel up left of
+    each sample, `across` and `down` how far beyond it the sample lies, `inside` >= 0 if it is one.
+    """
     half = np.float32(0.5)
     one = np.float32(1)
+    zero = np.float32(0)
     bottom = height - np.float32(2)
     right = width - np.float32(2)
-    for k in range(row.shape[0]):
-        x = np.float32(x0 + k) + half
-        depth = h[6] * x + v2
+    h0, h1, h2, h3, h4, h5, h6, h7, h8 = h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], h[8]
+    stride = np.int32(source.shape[1])
+    for k in range(out.shape[0]):
+        x = xs[k]
+        y = ys[k]
+        depth = h6 * x + h7 * y + h8
         inverse = one / depth
-        u = (h[0] * x + v0) * inverse - half
-        v = (h[3] * x + v1) * inverse - half
-        inside = (depth > 0) & (u >= 0) & (v >= 0) & (u <= right) & (v <= bottom)
-        u = min(max(u, np.float32(0)), right)
-        v = min(max(v, np.float32(0)), bottom)
+        u = (h0 * x + h1 * y + h2) * inverse - half
+        v = (h3 * x + h4 * y + h5) * inverse - half
+        inside[k] = min(min(u, right - u), min(min(v, bottom - v), depth))
+        u = min(max(u, zero), right)
+        v = min(max(v, zero), bottom)
         i = np.int32(v)
         j = np.int32(u)
-        a = v - np.float32(i)
-        b = u - np.float32(j)
-        top = source[i, j] * (one - b) + source[i, j + 1] * b
-        low = source[i + 1, j] * (one - b) + source[i + 1, j + 1] * b
-        row[k] = top * (one - a) + low * a if inside else UNUSABLE
+        across[k] = u - np.float32(j)
+        down[k] = v - np.float32(i)
+        where[k] = i * stride + j
+    flat = source.reshape(-1)
+    for k in range(out.shape[0]):
+        at = np.uint64(where[k])  # unsigned: a signed index is asked whether it counts from the end
+        under = at + np.uint64(stride)
+        top = flat[at] + (flat[at + np.uint64(1)] - flat[at]) * across[k]
+        low = flat[under] + (flat[under + np.uint64(1)] - flat[under]) * across[k]
+        out[k] = top + (low - top) * down[k] if inside[k] >= zero else UNUSABLE
+
+
+@helper(fastmath=True)
+def _window_sums(values, window, stride, length, rows, out):  # type: ignore[no-untyped-def]
+    """Sums over square windows of an image that is stored row by row, `stride` apart.
+
+    Windows begin at each of the first `length` pixels; what begins at a row's end is of no use.
+    """
+    reach = length + (window - 1) * stride
+    for k in range(reach):
+        rows[k] = values[k]
+    for step in range(1, window):
+        for k in range(reach):
+            rows[k] += values[k + step]
+    for k in range(length):
+        out[k] = rows[k]
+    for step in range(1, window):
+        below = rows[step * stride :]
+        for k in range(length):
+            out[k] += below[k]
 
 
 @kernel(fastmath=True, nogil=True)
-def _sweep_band(  # type: ignore[no-untyped-def]
-    band, reference, weight, sources, sizes, homographies, radius, var_min, keep, volume
+def _sweep_tile(  # type: ignore[no-untyped-def]
+    tile, across, reference, weight, sources, sizes, homographies, ranges, radius, var_min, volume
 ):
-    """Fill a band of rows of the cost volume."""
+    """Fill a tile of the cost volume, at the planes of its range."""
     height, width = reference.shape
-    y0 = band * _BAND
-    y1 = min(y0 + _BAND, height)
-    planes = homographies.shape[0]
-    count = sources.shape[0]
+    y0 = tile // across * _ROWS
+    x0 = tile % across * _COLUMNS
     window = 2 * radius + 1
-    rows = y1 - y0
-    warped = np.empty(width + 2 * radius, np.float32)
-    ref_row = np.empty(width + 2 * radius, np.float32)
-    ref_weight = np.empty(width + 2 * radius, np.float32)
-    products = np.empty((6, width + 2 * radius), np.float32)
-    # Horizontal window sums of m, m I, m w, m I I, m w w, m I w for every row of the band.
-    sums = np.empty((rows + 2 * radius, 6, width), np.float32)
-    total = np.empty((6, width), np.float32)
-    costs = np.empty((rows, count, width), np.float32)
-    enough = np.float32(0.5 * window * window)
+    stride = _COLUMNS + 2 * radius
+    size = (_ROWS + 2 * radius) * stride
+    length = _ROWS * stride
+    half = np.float32(0.5)
     one = np.float32(1)
     zero = np.float32(0)
-    half = np.float32(0.5)
-    for d in range(planes):
-        for s in range(count):
-            for r in range(rows + 2 * radius):
-                y = min(max(y0 - radius + r, 0), height - 1)
-                inside = 0 <= y0 - radius + r < height
-                for k in range(radius):
-                    ref_row[k] = zero
-                    ref_weight[k] = zero
-                    ref_row[width + radius + k] = zero
-                    ref_weight[width + radius + k] = zero
-                for x in range(width):
-                    ref_row[radius + x] = reference[y, x] - half
-                    ref_weight[radius + x] = weight[y, x] if inside else zero
-                _warp_row(
-                    sources[s], sizes[s, 0], sizes[s, 1], homographies[d, s],
-                    np.float32(y) + half, -radius, warped,
-                )  # fmt: skip
-                for k in range(width + 2 * radius):
-                    m = ref_weight[k] if warped[k] >= zero else zero
-                    w = (warped[k] - half) if warped[k] >= zero else zero
-                    i = ref_row[k]
-                    products[0, k] = m
-                    products[1, k] = m * i
-                    products[2, k] = m * w
-                    products[3, k] = m * i * i
-                    products[4, k] = m * w * w
-                    products[5, k] = m * i * w
-                for q in range(6):
-                    target = sums[r, q]
-                    values = products[q]
-                    for x in range(width):
-                        target[x] = values[x]
-                    for k in range(1, window):
-                        for x in range(width):
-                            target[x] += values[x + k]
-            for r in range(rows):
-                for q in range(6):
-                    out = total[q]
-                    for x in range(width):
-                        out[x] = sums[r, q, x]
-                    for k in range(1, window):
-                        more = sums[r + k, q]
-                        for x in range(width):
-                            out[x] += more[x]
-                cost_row = costs[r, s]
-                for x in range(width):
-                    n = max(total[0, x], one)
-                    mean_i = total[1, x] / n
-                    mean_w = total[2, x] / n
-                    var_i = max(total[3, x] / n - mean_i * mean_i, var_min)
-                    var_w = max(total[4, x] / n - mean_w * mean_w, var_min)
-                    covariance = total[5, x] / n - mean_i * mean_w
-                    cost = one - covariance / np.sqrt(var_i * var_w)
-                    cost = min(max(cost, zero), np.float32(1.2))
-                    cost_row[x] = cost if total[0, x] >= enough else np.float32(2)
-        for r in range(rows):
-            for x in range(width):
-                # Mean of the best `keep` of the sources that see the pixel (at most half of them
-                # plus one half, rounded up): what is hidden in some views is judged by the others.
-                seen = 0
-                for s in range(count):
-                    if costs[r, s, x] < np.float32(1.5):
-                        seen += 1
-                if seen == 0:
-                    volume[y0 + r, x, d] = NEUTRAL_COST
-                    continue
-                use = min((seen + 1) // 2, keep)
-                mean = zero
-                for _ in range(use):
-                    best = 0
-                    for s in range(1, count):
-                        if costs[r, s, x] < costs[r, best, x]:
-                            best = s
-                    mean += costs[r, best, x]
-                    costs[r, best, x] = np.float32(9)
-                volume[y0 + r, x, d] = mean / np.float32(use)
+    xs = np.empty(size, np.float32)
+    ys = np.empty(size, np.float32)
+    grey = np.empty(size, np.float32)
+    mask = np.empty(size, np.float32)
+    for k in range(size):
+        y = y0 - radius + k // stride
+        x = x0 - radius + k % stride
+        xs[k] = np.float32(x) + half
+        ys[k] = np.float32(y) + half
+        within = 0 <= y < height and 0 <= x < width
+        grey[k] = reference[y, x] - half if within else zero
+        mask[k] = weight[y, x] if within else zero
+    # Room beyond the end: windows that begin at a row's end read over it.
+    values = np.zeros((3, size + window), np.float32)
+    rows = np.empty(size, np.float32)
+    warped = np.empty(size, np.float32)
+    where = np.empty(size, np.int32)
+    across_px = np.empty(size, np.float32)
+    down_px = np.empty(size, np.float32)
+    inside = np.empty(size, np.float32)
+    own = np.empty((3, length), np.float32)  # sums of 1, i, i i over what the reference can use
+    part = np.empty((3, length), np.float32)  # the same over what the source shows too
+    sums = np.empty((3, length), np.float32)  # of w, w w, i w
+    best = np.empty(length, np.float32)
+    next_best = np.empty(length, np.float32)
+    seen = np.empty(length, np.float32)
+    for k in range(size):
+        values[0, k] = mask[k]
+        values[1, k] = mask[k] * grey[k]
+        values[2, k] = mask[k] * grey[k] * grey[k]
+    for q in range(3):
+        _window_sums(values[q], window, stride, length, rows, own[q])
+    enough = half * np.float32(window * window)
+    for d in range(ranges[tile, 0], ranges[tile, 1]):
+        for k in range(length):
+            best[k] = _UNSEEN
+            next_best[k] = _UNSEEN
+            seen[k] = zero
+        for s in range(sources.shape[0]):
+            _warp(
+                sources[s], sizes[s, 0], sizes[s, 1], homographies[d, s], xs, ys,
+                where, across_px, down_px, inside, warped,
+            )  # fmt: skip
+            hidden = zero
+            for k in range(size):
+                m = mask[k] if warped[k] >= zero else zero
+                w = m * (warped[k] - half)
+                hidden += mask[k] - m
+                values[0, k] = w
+                values[1, k] = w * w
+                values[2, k] = w * grey[k]
+            for q in range(3):
+                _window_sums(values[q], window, stride, length, rows, sums[q])
+            of = own
+            if hidden > zero:
+                of = part
+                for k in range(size):
+                    m = mask[k] if warped[k] >= zero else zero
+                    values[0, k] = m
+                    values[1, k] = m * grey[k]
+                    values[2, k] = m * grey[k] * grey[k]
+                for q in range(3):
+                    _window_sums(values[q], window, stride, length, rows, part[q])
+            count, of_i, of_ii = of[0], of[1], of[2]
+            of_w, of_ww, of_iw = sums[0], sums[1], sums[2]
+            for k in range(length):
+                share = one / max(count[k], one)
+                mean_i = of_i[k] * share
+                mean_w = of_w[k] * share
+                var_i = max(of_ii[k] * share - mean_i * mean_i, var_min)
+                var_w = max(of_ww[k] * share - mean_w * mean_w, var_min)
+                covariance = of_iw[k] * share - mean_i * mean_w
+                cost = min(max(one - covariance / np.sqrt(var_i * var_w), zero), np.float32(1.2))
+                known = count[k] >= enough
+                cost = cost if known else _UNSEEN
+                seen[k] += one if known else zero
+                next_best[k] = min(next_best[k], max(best[k], cost))
+                best[k] = min(best[k], cost)
+        # The better half of the sources that see the pixel, two at most: what is hidden in some
+        # views is judged by the others.
+        for k in range(length):
+            cost = half * (best[k] + next_best[k]) if seen[k] >= np.float32(3) else best[k]
+            best[k] = cost if seen[k] > zero else NEUTRAL_COST
+        for y in range(y0, min(y0 + _ROWS, height)):
+            for x in range(x0, min(x0 + _COLUMNS, width)):
+                volume[y, x, d] = best[(y - y0) * stride + x - x0]
 
 
 def cost_volume(
@@ -206,12 +240,14 @@ def cost_volume(
     homographies: Array,
     window: int,
     var_min: float = 2e-5,
-    keep: int = 2,
+    ranges: Integers | None = None,
+    buffer: Buffer | None = None,
 ) -> Array:
     """Matching cost of every pixel at every plane: 1 - ZNCC, averaged over the best sources.
 
-    Only pixels that are usable in both views enter a window; a window with less than half of its
-    pixels compares nothing. Deterministic for any thread count: bands of rows are independent.
+    The best two count, or of less than three that see the pixel the best. Only pixels that are
+    usable in both views enter a window; a window with less than half of its pixels compares
+    nothing. Deterministic for any thread count: tiles are independent.
 
     Args:
         reference: [H, W] float32 grey in 0..1.
@@ -221,16 +257,20 @@ def cost_volume(
         homographies: [D, S, 9] float32 from `plane_homographies`.
         window: side of the window in pixels, odd.
         var_min: least variance in the denominator, so that noise does not correlate.
-        keep: at most this many of the best sources are averaged.
+        ranges: [T, 2] int64 for every tile (row by row) its first plane and the one after its
+            last; None: all planes. Outside of them the volume holds anything.
+        buffer: where the volume goes; None: into memory of its own.
 
     Returns:
         [H, W, D] float32 in 0..1.2; `NEUTRAL_COST` where no source can be compared.
     """
     height, width = reference.shape
-    volume = np.empty((height, width, len(homographies)), np.float32)
+    volume = (buffer or Buffer()).of((height, width, len(homographies)))
+    down, across = tile_grid(reference.shape)
     each(
-        _sweep_band, -(-height // _BAND), np.ascontiguousarray(reference, np.float32),
-        usable.astype(np.float32), sources, sizes, homographies, int(window) // 2,
-        np.float32(var_min), int(keep), volume,
+        _sweep_tile, down * across, across, np.ascontiguousarray(reference, np.float32),
+        usable.astype(np.float32), sources, sizes, homographies,
+        full_ranges(reference.shape, len(homographies)) if ranges is None else ranges,
+        int(window) // 2, np.float32(var_min), volume,
     )  # fmt: skip
     return volume

@@ -13,7 +13,8 @@ from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.polish import polish, source_maps
 from stages.stereo.sgbm import sgbm_depth
 from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
-from stages.stereo.sweep import stack_sources
+from stages.stereo.sweep import cost_volume, stack_sources
+from stages.stereo.tiles import TILE, full_ranges, ranges_around, tile_grid
 from tests.stages.dense_scene import camera, render, scene
 
 # On so small an image depth changes four times as fast from pixel to pixel: smaller penalties.
@@ -325,3 +326,38 @@ def test_polish_is_an_option_of_the_sweep(three):
         assert np.median(relative_error(view, truth)) < 0.003
     again = dense_depths(images, everywhere(images), cameras, sparse, options, 1, lambda *_: None)
     assert same(found, again)
+
+
+def test_ranges_hold_what_the_coarser_level_found():
+    shape, planes = (3 * TILE[0] + 5, 2 * TILE[1] + 3), 100
+    down, across = tile_grid(shape)
+    position = np.linspace(0, 1, shape[1] // 2, dtype=np.float32) * np.ones(
+        (shape[0] // 2, 1), np.float32
+    )
+    ranges = ranges_around(position, shape, planes)
+    assert ranges.shape == (down * across, 2) == full_ranges(shape, planes).shape
+    assert (ranges[:, 0] >= 0).all() and (ranges[:, 1] <= planes).all()
+    for x in range(shape[1]):
+        plane = position[0, min(x // 2, position.shape[1] - 1)] * (planes - 1)
+        low, high = ranges[x // TILE[1]]
+        assert low <= plane < high
+    assert (ranges[0::across, 1] < planes).all()  # the left ones don't look at the far end
+
+
+def test_costs_inside_a_range_are_those_of_the_full_sweep():
+    rng = np.random.default_rng(0)
+    gray = rng.uniform(0, 1, (40, 60)).astype(np.float32)
+    usable = rng.uniform(0, 1, gray.shape) > 0.1
+    stack, sizes = stack_sources([np.roll(gray, 2, 1)], [usable])
+    shift = np.eye(3)[None] + np.arange(6)[:, None, None] * np.array(
+        [[0, 0, 1.0], [0] * 3, [0] * 3]
+    )
+    homographies = shift.reshape(6, 1, 9).astype(np.float32)
+    whole = cost_volume(gray, np.ones_like(usable), stack, sizes, homographies, 5)
+    part = full_ranges(gray.shape, 6)
+    part[:] = 1, 4
+    some = cost_volume(
+        gray, np.ones_like(usable), stack, sizes, homographies, 5, ranges=part
+    )  # fmt: skip
+    np.testing.assert_array_equal(some[:, :, 1:4], whole[:, :, 1:4])
+    assert (whole.argmin(2) == 2).mean() > 0.7

@@ -5,13 +5,22 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from stages.init.sfm.matching.features import Features, detect_features, merge_points, squeezed
+from stages.init.sfm.matching.features import (
+    Features,
+    copies_of,
+    describe,
+    detect_features,
+    joined,
+    merge_points,
+    squeezed,
+)
 from stages.init.sfm.matching.match import (
     candidate_pairs,
     match_features,
     overlap_counts,
     select_pairs,
 )
+from stages.init.sfm.reconstruct import weakly_linked
 
 
 def make_features(positions, descriptors):
@@ -149,3 +158,40 @@ def test_no_keypoints_outside_the_mask_and_the_same_ones_inside():
     assert mask[row, column].all()
     assert np.all(inside.descriptors == np.rint(inside.descriptors))
     np.testing.assert_allclose(np.linalg.norm(inside.descriptors, axis=1), 512, rtol=0.02)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_features_found_on_several_threads_are_those_of_one(tmp_path, threads):
+    grays, everywhere = [texture(seed) for seed in range(3)], np.ones((160, 200), bool)
+    squeezes = (1.0, 0.5)
+    copies = [copy for gray in grays for copy in copies_of(gray, squeezes, 0.0)]
+    found = describe(copies, True, 0.002, 6000, threads, tmp_path)
+    for view, gray in enumerate(grays):
+        alone = detect_features(gray, everywhere, squeezes=squeezes)
+        together = detect_features(
+            gray, everywhere, squeezes=squeezes, described=found[2 * view : 2 * view + 2]
+        )
+        np.testing.assert_array_equal(together.positions, alone.positions)
+        np.testing.assert_array_equal(together.descriptors, alone.descriptors)
+        np.testing.assert_array_equal(together.scales, alone.scales)
+    assert not list(tmp_path.iterdir())
+
+
+def test_copies_that_come_later_leave_the_indices_of_features_as_they_are():
+    gray, everywhere = texture(), np.ones((160, 200), bool)
+    whole = detect_features(gray, everywhere, squeezes=(1.0, 0.71, 0.5))
+    plain = detect_features(gray, everywhere, squeezes=(1.0,))
+    both = joined(plain, detect_features(gray, everywhere, squeezes=(0.71, 0.5)), 1.2)
+    np.testing.assert_array_equal(both.points, whole.points)
+    np.testing.assert_array_equal(both.positions, whole.positions)
+    np.testing.assert_array_equal(whole.plain().positions, plain.positions)
+    np.testing.assert_array_equal(whole.plain().points, plain.points)
+
+
+def test_views_with_less_than_two_links_or_outside_the_largest_group_are_weak():
+    ring = [(0, 1), (1, 2), (2, 3), (0, 3)]
+    assert weakly_linked(ring, 4) == set()
+    assert weakly_linked([(0, 1), (1, 2)], 3) == {0, 2}
+    assert weakly_linked([*ring, (4, 5)], 6) == {4, 5}
+    assert weakly_linked([(0, 1)], 2) == set()
+    assert weakly_linked([], 2) == {0, 1}

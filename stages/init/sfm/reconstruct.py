@@ -13,7 +13,13 @@ from threadpoolctl import threadpool_limits
 from pipeline.geometry.graph import Pair
 from stages.init.parallel import in_threads
 from stages.init.sfm.mapping import MappingInput, Solution
-from stages.init.sfm.matching.features import Features, detect_features
+from stages.init.sfm.matching.features import (
+    Features,
+    copies_of,
+    describe,
+    detect_features,
+    joined,
+)
 from stages.init.sfm.matching.match import (
     candidate_pairs,
     match_features,
@@ -118,15 +124,38 @@ def reconstruct(
     lenses, lens_of_view = group_lenses([gray.shape for gray in grays], focals)
 
     def matched(rolls: list[float]) -> tuple[list[Features], Solver]:
-        features = find_features(grays, valid, options, threads, progress, rolls)
-        given = MappingInput(
-            lenses=lenses,
-            lens_of_view=lens_of_view,
-            positions=[feature.positions for feature in features],
-            points=[feature.points for feature in features],
-            correspondences=match_views(features, ordered, options, pixel, threads, progress),
-        )
-        return features, Solver(given, options, pixel, seed, threads, scratch)
+        def solver_of(correspondences: dict[Pair, Correspondences]) -> Solver:
+            given = MappingInput(
+                lenses=lenses,
+                lens_of_view=lens_of_view,
+                positions=[feature.positions for feature in features],
+                points=[feature.points for feature in features],
+                correspondences=dict(sorted(correspondences.items())),
+            )
+            return Solver(given, options, pixel, seed, threads, scratch)
+
+        plain = tuple(squeeze for squeeze in options.squeezes if squeeze == 1) or options.squeezes
+        first = replace(options, squeezes=plain)
+        features = find_features(grays, valid, first, threads, progress, rolls, scratch)
+        counts = overlaps(features, ordered, options)
+        near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
+        found = match_pairs(features, near, options, pixel, threads, progress)
+        solver = solver_of(found)
+        lacking = weakly_linked(solver.links(), len(grays))
+        far = [pair for pair in counts if pair not in found and lacking & {*pair}]
+        if not far:
+            return features, solver
+        copies = tuple(squeeze for squeeze in options.squeezes if squeeze not in plain)
+        turned = sorted({view for pair in far for view in pair}) if copies else []
+        more = find_features(
+            [grays[view] for view in turned], [valid[view] for view in turned],
+            replace(options, squeezes=copies), threads, progress, [rolls[view] for view in turned],
+            scratch,
+        )  # fmt: skip
+        for view, others in zip(turned, more, strict=True):
+            features[view] = joined(features[view], others, options.merge_radius)
+        found |= match_pairs(features, far, options, pixel, threads, progress)
+        return features, solver_of(found)
 
     features, solver = matched([0.0] * len(grays))
     linked = solver.links()
@@ -209,20 +238,31 @@ def find_features(
     threads: int,
     progress: Progress,
     rolls: list[float] | None = None,
+    scratch: Path | None = None,
 ) -> list[Features]:
     """The features of all views; `rolls` are their rolls in degrees, if any is known."""
-
-    def detect(view: int) -> Features:
-        return detect_features(
-            grays[view], valid[view],
-            squeezes=options.squeezes, upright=options.upright,
-            peak_threshold=options.peak_threshold, max_features=options.max_features,
-            merge_radius=options.merge_radius, roll=rolls[view] if rolls else 0.0,
-        )  # fmt: skip
-
-    return in_threads(
-        detect, range(len(grays)), threads, lambda done: progress("features", done, len(grays))
-    )
+    rolls = rolls or [0.0] * len(grays)
+    count = len(options.squeezes)
+    features: list[Features] = []
+    # A few views at a time, so that one sees how it goes on.
+    for start in range(0, len(grays), 2 * threads):
+        views = range(start, min(start + 2 * threads, len(grays)))
+        copies = [
+            copy for view in views for copy in copies_of(grays[view], options.squeezes, rolls[view])
+        ]
+        found = describe(
+            copies, options.upright, options.peak_threshold, options.max_features, threads, scratch
+        )
+        for number, view in enumerate(views):
+            features.append(
+                detect_features(
+                    grays[view], valid[view],
+                    squeezes=options.squeezes, merge_radius=options.merge_radius, roll=rolls[view],
+                    described=found[number * count : (number + 1) * count],
+                )
+            )  # fmt: skip
+        progress("features", len(features), len(grays))
+    return features
 
 
 def match_views(
@@ -233,23 +273,51 @@ def match_views(
     threads: int,
     progress: Progress,
 ) -> dict[Pair, Correspondences]:
-    """The matches of all pairs of views that may overlap."""
+    """The matches of all pairs of views that may overlap.
+
+    Views near each other match without the squeezed copies, at a fifth of the cost.
+    """
+    counts = overlaps(features, ordered, options)
+    near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
+    plain = [feature.plain() for feature in features]
+    found = match_pairs(plain, near, options, pixel, threads, progress)
+    far = [pair for pair in counts if pair not in found]
+    found |= match_pairs(features, far, options, pixel, threads, progress)
+    return dict(sorted(found.items()))
+
+
+def overlaps(features: list[Features], ordered: bool, options: ClassicalOptions) -> dict[Pair, int]:
+    """The pairs of views worth matching, with the count that says how much they overlap."""
     pairs = candidate_pairs(len(features), ordered, options.window)
     with threadpool_limits(1, "blas"):
         counts = overlap_counts(features, pairs, options.overlap_features)
-    pairs = select_pairs(counts, len(features), options.pairs_per_view)
-    plain = [np.flatnonzero(feature.squeezes == 1) for feature in features]
+    chosen = select_pairs(counts, len(features), options.pairs_per_view)
+    return {pair: counts[pair] for pair in chosen}
+
+
+def weakly_linked(links: list[Pair], count: int) -> set[int]:
+    """The views outside the largest group of linked ones, or linked to less than two others."""
+    group = groups(links, count)
+    largest = max(set(group), key=lambda number: (group.count(number), -number))
+    degrees = np.bincount(np.array(links, np.int64).ravel(), minlength=count)
+    return {
+        view for view in range(count) if group[view] != largest or degrees[view] < min(2, count - 1)
+    }
+
+
+def match_pairs(
+    features: list[Features],
+    pairs: list[Pair],
+    options: ClassicalOptions,
+    pixel: float,
+    threads: int,
+    progress: Progress,
+) -> dict[Pair, Correspondences]:
+    """The matches of these pairs of views."""
 
     def match(pair: Pair) -> Correspondences:
         i, j = pair
-        # Views this near each other match without the squeezed copies, at a fifth of the cost.
-        near = counts[pair] >= options.overlap_matches
-        found = match_features(
-            features[i], features[j],
-            ratio=options.match_ratio,
-            use_first=plain[i] if near else None,
-            use_second=plain[j] if near else None,
-        )  # fmt: skip
+        found = match_features(features[i], features[j], ratio=options.match_ratio)
         positions_i = features[i].positions[found[:, 0]]
         positions_j = features[j].positions[found[:, 1]]
         rolls = features[i].roll, features[j].roll

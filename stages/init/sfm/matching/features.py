@@ -7,7 +7,11 @@ the cost of full affine simulation (Morel & Yu, ASIFT, 2009).
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +19,9 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.models.colmap import quiet_pycolmap
+
+#: Keypoints [K, 4] float32 (x, y, scale, orientation) and descriptors [K, 128] float32.
+Described = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,16 @@ class Features:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def plain(self) -> Features:
+        """Those of the image itself; they must come first, so that indices stay the same."""
+        count = int((self.squeezes == 1).sum())
+        if count in (0, len(self)) or (self.squeezes[:count] != 1).any():
+            return self
+        return Features(
+            self.positions[:count], self.descriptors[:count], self.scales[:count],
+            self.squeezes[:count], self.points[:count], self.roll,
+        )  # fmt: skip
+
     def largest(self, count: int) -> npt.NDArray[np.int64]:
         """[<= count] indices of the unsqueezed keypoints of the largest scale, largest first."""
         plain = np.flatnonzero(self.squeezes == 1)
@@ -58,6 +75,7 @@ def detect_features(
     max_features: int = 6000,
     merge_radius: float = 1.2,
     roll: float = 0.0,
+    described: Sequence[Described] | None = None,
 ) -> Features:
     """Detect and describe the keypoints of one view.
 
@@ -70,21 +88,26 @@ def detect_features(
         max_features: per copy, the largest are kept.
         merge_radius: pixels within which keypoints count as the same place.
         roll: degrees by which the photograph is rolled clockwise; it is turned back first.
+        described: what `describe` found on each of `copies_of`, if that has been done.
     """
     positions, descriptors, scales, levels = [], [], [], []
     turned, original_from_turned = turned_back(gray, roll)
-    for squeeze in squeezes:
-        copy = squeezed(turned, squeeze)
-        keypoints, described = _sift(copy, upright, peak_threshold, max_features)
-        place = keypoints[:, :2].astype(np.float64) * (turned.shape[1] / copy.shape[1], 1.0)
+    if described is None:
+        described = [
+            _sift(squeezed(turned, squeeze), upright, peak_threshold, max_features)
+            for squeeze in squeezes
+        ]
+    for squeeze, (keypoints, rows) in zip(squeezes, described, strict=True):
+        width = squeezed_width(turned.shape[1], squeeze)
+        place = keypoints[:, :2].astype(np.float64) * (turned.shape[1] / width, 1.0)
         place = place @ original_from_turned[:, :2].T + original_from_turned[:, 2]
         within = ((place >= 0) & (place < gray.shape[::-1])).all(1)
-        keypoints, described, place = keypoints[within], described[within], place[within]
+        keypoints, rows, place = keypoints[within], rows[within], place[within]
         column = np.clip(place[:, 0].astype(np.int64), 0, gray.shape[1] - 1)
-        row = np.clip(place[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
-        inside = valid[row, column]
+        line = np.clip(place[:, 1].astype(np.int64), 0, gray.shape[0] - 1)
+        inside = valid[line, column]
         positions.append(place[inside])
-        descriptors.append(described[inside])
+        descriptors.append(rows[inside])
         scales.append(keypoints[inside, 2])
         levels.append(np.full(int(inside.sum()), squeeze, np.float32))
     place = np.concatenate(positions)
@@ -163,9 +186,70 @@ def squeezed(gray: npt.NDArray[np.uint8], squeeze: float) -> npt.NDArray[np.uint
     # .8 pixels is the blur that SIFT takes an image to have (as in ASIFT).
     sigma = 0.8 * np.sqrt(1 / squeeze**2 - 1)
     blurred = cv2.GaussianBlur(gray, (0, 0), sigmaX=sigma, sigmaY=0.01)
-    width = max(round(gray.shape[1] * squeeze), 1)
+    width = squeezed_width(gray.shape[1], squeeze)
     small = cv2.resize(blurred, (width, gray.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(small, np.uint8)
+
+
+def squeezed_width(width: int, squeeze: float) -> int:
+    """Pixels of a squeezed copy."""
+    return width if squeeze >= 1 else max(round(width * squeeze), 1)
+
+
+def copies_of(
+    gray: npt.NDArray[np.uint8], squeezes: Sequence[float], roll: float
+) -> list[npt.NDArray[np.uint8]]:
+    """The copies of an image [H, W] uint8, without its roll, that `detect_features` describes."""
+    turned, _ = turned_back(gray, roll)
+    return [squeezed(turned, squeeze) for squeeze in squeezes]
+
+
+def describe(
+    images: Sequence[npt.NDArray[np.uint8]], upright: bool, peak_threshold: float,
+    max_features: int, threads: int, scratch: Path | None,
+) -> list[Described]:  # fmt: skip
+    """What `detect_features` finds on images, on several threads.
+
+    Through files: COLMAP's extractor in memory lets no other thread of Python run meanwhile.
+
+    Args:
+        images: arrays [H, W] uint8; sizes may differ.
+        upright, peak_threshold, max_features: as for `detect_features`.
+        threads: change nothing but the time.
+        scratch: folder for the files; None: the system's.
+
+    Returns:
+        For each image keypoints [K, 4] float32 (x, y, scale, orientation) and RootSIFT descriptors
+        [K, 128] float32 in 0..255.
+    """
+    pycolmap = quiet_pycolmap()
+    result = []
+    with tempfile.TemporaryDirectory(dir=scratch) as name:
+        folder, database_path = Path(name) / "images", str(Path(name) / "features.db")
+        folder.mkdir()
+        for number, image in enumerate(images):
+            # quickly packed: the file lives for a second
+            cv2.imwrite(str(folder / f"{number:06d}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+        pycolmap.extract_features(
+            database_path, str(folder), camera_mode=pycolmap.CameraMode.PER_IMAGE,
+            extraction_options=_sift_options(upright, peak_threshold, max_features, threads),
+            device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        database = pycolmap.Database.open(database_path)
+        try:
+            numbers = {image.name: image.image_id for image in database.read_all_images()}
+            for number in range(len(images)):
+                image_id = numbers[f"{number:06d}.png"]
+                x, y, a, b, c, d = (
+                    np.asarray(database.read_keypoints(image_id), np.float32).reshape(-1, 6).T
+                )
+                rows = np.array(database.read_descriptors(image_id).data, np.float32)
+                scale = (np.hypot(a, c) + np.hypot(b, d)) / 2
+                keypoints = np.stack([x, y, scale, np.arctan2(c, a)], 1).astype(np.float32)
+                result.append((keypoints, rows.reshape(len(keypoints), 128)))
+        finally:
+            database.close()
+    return result
 
 
 def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArray[np.int64]:
@@ -175,16 +259,29 @@ def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArr
     around it.
     """
     leader = np.full(len(positions), -1, np.int64)
-    if not len(positions):
-        return leader
-    around = cKDTree(positions).query_ball_point(positions, radius, return_sorted=True)
-    for index, neighbours in enumerate(around):
-        if leader[index] >= 0:
-            continue
-        for neighbour in neighbours:
-            if leader[neighbour] < 0:
-                leader[neighbour] = index
-    return leader
+    if len(positions) < 2:
+        return np.arange(len(positions))
+    near = cKDTree(positions).query_pairs(radius, output_type="ndarray")
+    near = near[np.lexsort((near[:, 1], near[:, 0]))]
+    for first, second in near.tolist():
+        if leader[first] < 0:
+            leader[first] = first
+        if leader[first] == first and leader[second] < 0:
+            leader[second] = first
+    return np.where(leader < 0, np.arange(len(positions)), leader)
+
+
+def joined(first: Features, second: Features, merge_radius: float) -> Features:
+    """The features of one view with further ones behind them; those keep their indices."""
+    positions = np.concatenate([first.positions, second.positions])
+    return Features(
+        positions=positions,
+        descriptors=np.concatenate([first.descriptors, second.descriptors]),
+        scales=np.concatenate([first.scales, second.scales]),
+        squeezes=np.concatenate([first.squeezes, second.squeezes]),
+        points=merge_points(positions, merge_radius),
+        roll=first.roll,
+    )
 
 
 def _sift(
@@ -192,12 +289,7 @@ def _sift(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Keypoints [K, 4] (x, y, scale, orientation) and RootSIFT descriptors [K, 128] in 0..255."""
     pycolmap = quiet_pycolmap()
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = 1
-    options.sift.max_num_features = max_features
-    options.sift.peak_threshold = peak_threshold
-    options.sift.upright = upright
+    options = _sift_options(upright, peak_threshold, max_features, 1)
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     keypoints, described = extractor.extract_from_uint8_array(gray)
     rows = [
@@ -208,3 +300,13 @@ def _sift(
         np.array(rows, np.float32).reshape(-1, 4),
         np.array(described.data, np.float32).reshape(len(rows), 128),
     )
+
+
+def _sift_options(upright: bool, peak_threshold: float, max_features: int, threads: int) -> Any:
+    options = quiet_pycolmap().FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = threads
+    options.sift.max_num_features = max_features
+    options.sift.peak_threshold = peak_threshold
+    options.sift.upright = upright
+    return options

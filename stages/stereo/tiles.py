@@ -1,0 +1,72 @@
+"""The tiles of an image, each with the range of planes among which its depth is looked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+Array = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int64]
+
+#: Rows and columns of a tile, which is swept at once. Small: the depth in it varies little. With
+#: the rim of the default window its rows are 32 pixels, whole registers.
+TILE = (16, 28)
+#: Planes added at either end of what the coarser level found: it is right within two of these
+#: planes for 81 % of the pixels of a scan video, within four for 86 %, and hardly more beyond.
+MARGIN = 4
+#: Pixels of the coarser level around a tile that are asked too.
+RING = 2
+
+
+class Buffer:
+    """Memory for one volume after the other: fresh pages cost as much as the work done in them."""
+
+    def __init__(self) -> None:
+        self._values = np.empty(0, np.float32)
+
+    def of(self, shape: tuple[int, ...]) -> Array:
+        """An array of this shape, float32, that holds anything; it ends the one before."""
+        size = int(np.prod(shape))
+        if size > len(self._values):
+            self._values = np.empty(size, np.float32)
+        return self._values[:size].reshape(shape)
+
+
+def tile_grid(shape: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of the tiles that cover an image [H, W]."""
+    return -(-shape[0] // TILE[0]), -(-shape[1] // TILE[1])
+
+
+def full_ranges(shape: tuple[int, int], planes: int) -> Integers:
+    """[T, 2] the range of all planes for every tile of an image [H, W]."""
+    down, across = tile_grid(shape)
+    return np.tile(np.array([0, planes], np.int64), (down * across, 1))
+
+
+def ranges_around(position: Array, shape: tuple[int, int], planes: int) -> Integers:
+    """The planes near those that a coarser level decided for.
+
+    Args:
+        position: [h, w] float32, of each pixel of the coarser level, where it lies between the
+            first plane (0) and the last (1).
+        shape: (H, W) of the image.
+        planes: of the image.
+
+    Returns:
+        [T, 2] int64 for every tile of the image, row by row, its first plane and the one after its
+        last.
+    """
+    size = 2 * RING + 1
+    least = ndimage.minimum_filter(position, size, mode="nearest")
+    most = ndimage.maximum_filter(position, size, mode="nearest")
+    down, across = tile_grid(shape)
+    ranges = np.empty((down * across, 2), np.int64)
+    high, wide = position.shape
+    for tile in range(down * across):
+        y, x = tile // across * TILE[0], tile % across * TILE[1]
+        rows = slice(y * high // shape[0], -(-(min(y + TILE[0], shape[0]) * high) // shape[0]))
+        columns = slice(x * wide // shape[1], -(-(min(x + TILE[1], shape[1]) * wide) // shape[1]))
+        ranges[tile, 0] = np.floor(least[rows, columns].min() * (planes - 1)) - MARGIN
+        ranges[tile, 1] = np.ceil(most[rows, columns].max() * (planes - 1)) + MARGIN + 1
+    return np.clip(ranges, [0, 1], [planes - 1, planes])
