@@ -14,14 +14,7 @@ from stages.fit.parts.detail import Detail
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
 from stages.fit.parts.progressive import Progressive
-from stages.fit.parts.start import (
-    COARSE_SIDE,
-    Coarse,
-    Filling,
-    Saturation,
-    Shading,
-    coarse_factor,
-)
+from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
 from stages.fit.parts.surface import Surface, Warp
 from stages.fit.settings import (
     AUTO,
@@ -55,7 +48,7 @@ class Basics(PartSettings):
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
     bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
     same images and gradients in a first trial)"""
-    iterations: AutoInt = automatic({3: 400, 6: 1000}, held=240, ge=1)
+    iterations: AutoInt = automatic({3: 400, 6: 500}, held=240, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
     initial_points: AutoInt = automatic({3: 15000, 6: 30000}, held=30000, ge=4)
@@ -154,13 +147,7 @@ class FitSettings(FitConfig):
         return self.model_copy(update=changes)
 
 
-def resolve(
-    config: FitConfig,
-    views: int,
-    seed: int,
-    held: bool | None = None,
-    long_side: int = 2 * COARSE_SIDE,
-) -> FitSettings:
+def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) -> FitSettings:
     """Replace every ``"auto"`` by what it stands for.
 
     Args:
@@ -168,7 +155,6 @@ def resolve(
         views: how many are placed.
         seed: of the run.
         held: what ``hold_surface: auto`` comes to; None: no.
-        long_side: of the views, in pixels.
     """
     values = dict(config)
     if values["hold_surface"] == AUTO:
@@ -178,8 +164,6 @@ def resolve(
         if values[name] == AUTO and isinstance(rule, dict) and "views" in rule:
             flat = values["hold_surface"] and rule["held"] is not None
             values[name] = rule["held"] if flat else by_rule(rule["views"], views)
-    if values["coarse_factor"] == AUTO:
-        values["coarse_factor"] = coarse_factor(long_side)
     if values["densify_until_iter"] == AUTO:
         values["densify_until_iter"] = max(0, values["iterations"] - SETTLE)
     return FitSettings.model_construct(**values, seed=seed)

@@ -72,8 +72,7 @@ class FitStage(Stage):
         held = worth_holding(
             placed_cameras, points.positions.astype(float), context.config.hold_min_angle
         )
-        long_side = max(max(view.image.shape[:2]) for view in placed)
-        settings = resolve(context.config, len(placed), context.seed, held, long_side)
+        settings = resolve(context.config, len(placed), context.seed, held)
 
         def report(iteration: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}

@@ -50,11 +50,11 @@ class Density(
         absgrad: Literal["split", "both", "off"] = "split"
         """absolute gradients decide on: splits (AbsGS), splits and clones (gsplat), neither
         (3DGS)"""
-        densify_from_iter: Whole = 300
+        densify_from_iter: Whole = 150
         """first iteration of densification"""
         densify_until_iter: AutoInt = automatic(f"{SETTLE} before the end")
         """last iteration of densification"""
-        densification_interval: Count = 100
+        densification_interval: Count = 50
         """iterations between densifications"""
         densify_grad_threshold: Positive = 2e-4
         """signed screen gradient above which Gaussians are densified"""

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from pipeline.artifacts.confidence import MEASURED
 from stages.fit.parts.base import Part
-from stages.fit.settings import AutoFloat, AutoInt, PartSettings, Positive, Share, automatic
+from stages.fit.settings import AutoFloat, Count, PartSettings, Positive, Share, automatic
 
 if TYPE_CHECKING:
     from stages.fit.config import FitSettings
-
-#: longer side of the smallest images, pixels: crowns are about 30 wide, and a step takes a tenth of
-#: what it does at 1024
-COARSE_SIDE = 256
 
 
 class Filling(Part, absent={"trusted_confidence": 1.0, "fill_share": 1.0}):
@@ -64,11 +59,6 @@ def reduction(settings: FitSettings, iteration: int) -> int:
     return factors[min(int((iteration - 1) * len(factors) / coarse), len(factors) - 1)]
 
 
-def coarse_factor(long_side: int) -> int:
-    """What ``coarse_factor: auto`` comes to for views of a size: a power of two."""
-    return 1 << max(0, round(math.log2(max(long_side, 1) / COARSE_SIDE)))
-
-
 def coarse_factors(settings: FitSettings) -> list[int]:
     """Factors above 1 by which images are reduced one after another, the largest first."""
     factor = settings.coarse_factor if settings.coarse_fraction > 0 else 1
@@ -81,7 +71,5 @@ class Coarse(Part, absent={"coarse_fraction": 0.0}):
     class Settings(PartSettings):
         coarse_fraction: Share = 0.7
         """share of the iterations at reduced size"""
-        coarse_factor: AutoInt = automatic(
-            f"what leaves about {COARSE_SIDE} pixels of the longer side", ge=1, le=16
-        )
+        coarse_factor: Annotated[Count, Field(le=16)] = 2
         """by which factor images are reduced at first; it is halved until it is 1"""
