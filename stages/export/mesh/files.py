@@ -15,9 +15,10 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz"]
     fields = [(n, "<f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")]
     rows = np.empty(len(mesh.vertices), fields)
+    normals = vertex_normals(mesh)
     for index, (position, normal) in enumerate(zip(names[:3], names[3:], strict=True)):
         rows[position] = mesh.vertices[:, index]
-        rows[normal] = vertex_normals(mesh)[:, index]
+        rows[normal] = normals[:, index]
     eight_bit = np.clip(np.rint(mesh.colors * 255), 0, 255).astype(np.uint8)
     for index, channel in enumerate(("red", "green", "blue")):
         rows[channel] = eight_bit[:, index]
