@@ -67,7 +67,7 @@ def fused(step: int = 1, noise: float = 0.0, smooth: bool = False) -> Mesh:
 @pytest.mark.parametrize(("step", "smooth"), [(1, False), (2, False), (2, True), (4, True)])
 def test_fusion_finds_the_ball_where_it_was_seen(step: int, smooth: bool) -> None:
     mesh = fused(step, smooth=smooth)
-    assert len(mesh) > 3000 / step**2
+    assert len(mesh) > 2500 / step**2
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1)
     assert np.median(error) < 0.15 * VOXEL
     assert np.percentile(error, 95) < 0.5 * VOXEL
@@ -96,7 +96,7 @@ def test_smoothing_irons_out_noise() -> None:
 
     noise = 0.3 * VOXEL
     rough, smooth = fused(1, noise), fused(1, noise, smooth=True)
-    assert unevenness(smooth) < 0.5 * unevenness(rough)
+    assert unevenness(smooth) < 0.6 * unevenness(rough)
     assert np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).mean() < 0.2 * VOXEL
     assert smooth.vertices[:, 2].max() < 0.8
 

@@ -1,6 +1,6 @@
 """FLIP: how different two pictures look to somebody who flips between them.
 
-Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020, in the version for
+Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020; the version for
 pictures of 8 bits (LDR). The tests hold it against the authors' program, which takes ten times as
 long.
 """
@@ -64,13 +64,18 @@ def flip_map(image: Image, truth: Image) -> Floats:
 
 def _seen(picture: Image) -> tuple[Floats, Floats, Floats]:
     """Colours as they are perceived (Hunt-adjusted L*a*b*) and strengths of edges and of spots."""
-    opponent = cv2.transform(_LINEAR[picture], _OPPONENT_FROM_RGB.astype(np.float32))
+    opponent = _times(_LINEAR[picture], _OPPONENT_FROM_RGB)
     blurred = np.stack(
         [_sensed(opponent[..., channel], SENSITIVITY[channel]) for channel in range(3)], -1
     )
-    rgb = np.clip(cv2.transform(blurred, _RGB_FROM_OPPONENT.astype(np.float32)), 0, 1)
+    rgb = np.clip(_times(blurred, _RGB_FROM_OPPONENT), 0, 1)
     brightness = np.ascontiguousarray(opponent[..., 0]) / np.float32(116)
     return _hunt_lab(rgb), _strength(brightness, 1), _strength(brightness, 2)
+
+
+def _times(picture: Floats, matrix: Array) -> Floats:
+    """A matrix [3, 3] times each pixel of [H, W, 3]."""
+    return np.asarray(cv2.transform(picture, matrix.astype(np.float32)), np.float32)
 
 
 def _sensed(channel: Floats, gaussians: tuple[tuple[float, float], ...]) -> Floats:
@@ -101,7 +106,7 @@ def _strength(brightness: Floats, order: int) -> Floats:
     ).astype(np.float32)
     flat = (gaussian / gaussian.sum()).astype(np.float32)
     across, down = _filtered(brightness, derived, flat), _filtered(brightness, flat, derived)
-    return np.asarray(cv2.magnitude(across, down))
+    return np.sqrt(across * across + down * down)  # cv2.magnitude differs by where arrays lie
 
 
 def _filtered(channel: Floats, across: Floats, down: Floats) -> Floats:
@@ -111,9 +116,7 @@ def _filtered(channel: Floats, across: Floats, down: Floats) -> Floats:
 
 def _hunt_lab(rgb: npt.NDArray[np.floating]) -> Floats:
     """L*a*b* of linear RGB [..., 3]; dark colours look less colourful (Hunt)."""
-    ratio = cv2.transform(
-        np.asarray(rgb, np.float32), (_XYZ_FROM_RGB / _WHITE[:, None]).astype(np.float32)
-    )
+    ratio = _times(rgb.astype(np.float32), _XYZ_FROM_RGB / _WHITE[:, None])
     delta = 6 / 29
     low = ratio * np.float32(1 / (3 * delta**2)) + np.float32(4 / 29)
     root = np.where(ratio > delta**3, np.cbrt(ratio), low)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 
 from stages.export.mesh.surface import Mesh, face_normals, vertex_normals
 
@@ -22,10 +21,17 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
     eight_bit = np.clip(np.rint(mesh.colors * 255), 0, 255).astype(np.uint8)
     for index, channel in enumerate(("red", "green", "blue")):
         rows[channel] = eight_bit[:, index]
-    faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces
-    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements, byte_order="<").write(str(path))
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", (3,))])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    # plyfile writes lists one by one
+    columns = [f"property float {name}" for name in names]
+    columns += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = [
+        "ply", "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}", *columns,
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", "",
+    ]  # fmt: skip
+    path.write_bytes("\n".join(header).encode("ascii") + rows.tobytes() + faces.tobytes())
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:
