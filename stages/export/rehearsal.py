@@ -33,7 +33,7 @@ def film() -> None:
     """A frame of Gaussians with a light, and of some without."""
     place = np.array([[0, 0, 2]], np.float32)
     one = np.ones((1, 3), np.float32)
-    light = Light(0.5 * one, -place / 2, 0.5, 1.0, 2.0, (60.0, 12.0), (0.5, 0.05))
+    light = Light(one, -place, 0.5, 1.0, 2.0, (60.0, 12.0), (0.5, 0.05))
     for lamp in (light, None):
         gaussians = Gaussians(
             place, np.array([[1, 0, 0, 0]], np.float32), -2 * one, np.ones(1, np.float32),

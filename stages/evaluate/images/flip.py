@@ -64,10 +64,9 @@ def flip_map(image: Image, truth: Image) -> Floats:
 
 def _seen(picture: Image) -> tuple[Floats, Floats, Floats]:
     """Colours as they are perceived (Hunt-adjusted L*a*b*) and strengths of edges and of spots."""
-    opponent = _times(_LINEAR[picture], _OPPONENT_FROM_RGB)
-    blurred = np.stack(
-        [_sensed(opponent[..., channel], SENSITIVITY[channel]) for channel in range(3)], -1
-    )
+    opponent = _times(np.asarray(_LINEAR[picture], np.float32), _OPPONENT_FROM_RGB)
+    channels = [_sensed(opponent[..., channel], SENSITIVITY[channel]) for channel in range(3)]
+    blurred: Floats = np.stack(channels, -1)
     rgb = np.clip(_times(blurred, _RGB_FROM_OPPONENT), 0, 1)
     brightness = np.ascontiguousarray(opponent[..., 0]) / np.float32(116)
     return _hunt_lab(rgb), _strength(brightness, 1), _strength(brightness, 2)

@@ -300,7 +300,7 @@ def zero_surface(field: Field, step: int) -> tuple[Array, Numbers]:
     a, b, c, d = (vertices[quad[:, corner]] for corner in range(4))
     along = ((a - c) ** 2).sum(1) <= ((b - d) ** 2).sum(1)
     two = np.where(along[:, None], quad[:, [0, 1, 2, 0, 2, 3]], quad[:, [1, 2, 3, 1, 3, 0]])
-    return vertices, two.reshape(-1, 3).astype(np.int32)
+    return np.asarray(vertices, np.float64), two.reshape(-1, 3).astype(np.int32)
 
 
 @helper

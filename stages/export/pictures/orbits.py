@@ -197,8 +197,8 @@ def there_and_back(
     swing = np.sin(2 * np.pi * np.arange(count) / count)
     places, place_of_frame = np.unique(np.round(swing, 9), return_inverse=True)
     low, high = orbit.span()
-    azimuths = (low + high) / 2 + (high - low) / 2 * places
-    poses = path_poses(orbit, azimuths, sway * np.sin(np.pi * places))
+    azimuths = np.asarray((low + high) / 2 + (high - low) / 2 * places, np.float64)
+    poses = path_poses(orbit, azimuths, np.asarray(sway * np.sin(np.pi * places), np.float64))
     return _cameras(poses, lens(cameras, *size)), place_of_frame.tolist()
 
 
