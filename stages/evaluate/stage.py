@@ -26,6 +26,7 @@ class EvaluateStage(Stage):
     requires = ("views", "cameras", "gaussians")
     optional = ("held_out", "points")
     provides = ("metrics",)
+    rehearsals = ("stages.evaluate.rehearsal:support",)
     libraries = (
         "numpy", "numba", "opencv-contrib-python-headless", "scipy", "open3d", "pycolmap",
         "torchmetrics", "torch",
