@@ -59,6 +59,7 @@ def run(
     dry_run: bool = False,
     verify: bool = False,
     share: Share | None = None,
+    profile: bool = False,
     reporter: Reporter | None = None,
 ) -> RunSummary:
     """Make a scene of photographs; every stage's result is kept and used again while it is valid.
@@ -76,6 +77,8 @@ def run(
         verify: read every byte of the results, and not only of those that seem to have changed.
         share: who else may read the workspace: ``nobody`` or the owner's ``group``; None: as its
             folder is already. Until the run ends, all that this process writes is kept from others.
+        profile: write ``profile/STAGE.html`` into the workspace for each stage that runs: where its
+            time went. Needs the extra ``profile``.
         reporter: hears of the progress.
 
     Returns:
@@ -88,6 +91,7 @@ def run(
     return _engine().run(
         images, workspace=workspace, preset=preset, overrides=overrides, stages=stages,
         from_stage=from_stage, force=force, dry_run=dry_run, verify=verify, share=share,
+        profile=profile,
         reporter=reporter,
     )  # fmt: skip
 

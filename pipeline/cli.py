@@ -113,6 +113,9 @@ def run_command(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would run.")] = False,
     verify: Verify = False,
     share: Sharing = None,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="Write WORKSPACE/profile/STAGE.html: where time goes.")
+    ] = False,
     as_json: AsJson = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the whole trace of an error.")
@@ -137,6 +140,7 @@ def run_command(
         dry_run=dry_run,
         verify=verify,
         share=_share(share),
+        profile=profile,
         reporter=make_reporter(quiet=dry_run),
     )
     if as_json:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline import profiling
 from pipeline.config import Config
 from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
 from pipeline.kernels.news import told_to
@@ -158,8 +159,24 @@ class Runner:
     """One request on one workspace."""
 
     def __init__(
-        self, request: Request, config: Config, reporter: Reporter, *, verify: bool = False
+        self,
+        request: Request,
+        config: Config,
+        reporter: Reporter,
+        *,
+        verify: bool = False,
+        profile: bool = False,
     ) -> None:
+        """
+        Args:
+            profile: write a page about where the time of each stage goes that runs.
+
+        Raises:
+            RequestError: the request is wrong, or the profiler is not installed.
+        """
+        if profile:
+            profiling.require_profiler()
+        self.profile = profile
         self.request = request
         self.config = config
         self.reporter = reporter
@@ -314,7 +331,7 @@ class Runner:
         try:
             folder = self.store.begin(name, key)
             context = RunContext(planned, self.config, self.store, folder, self.reporter)
-            with Measurement() as measurement:
+            with Measurement() as measurement, self._profiled(name):
                 stage.run(context)
             missing = [kind for kind in stage.provides if kind not in context.outputs]
             if missing:
@@ -339,6 +356,17 @@ class Runner:
         except Exception as error:
             signals.check()
             raise self._explain_failure(error, name, key) from error
+
+    @contextlib.contextmanager
+    def _profiled(self, name: str) -> Iterator[None]:
+        """Where the time of a stage goes, if that was asked for."""
+        if not self.profile:
+            yield
+            return
+        page = self.request.workspace / profiling.FOLDER / f"{name}.html"
+        with profiling.profiled(page):
+            yield
+        self.reporter.message(f"{name}: where its time went: {page}")
 
     def _thrift(self) -> list[str]:
         """What the stages of this run know to do where memory runs out."""

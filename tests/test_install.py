@@ -64,9 +64,9 @@ def test_what_is_imported_is_required(setup_cfg: configparser.ConfigParser) -> N
     """And what is required is imported."""
     modules = {
         "cv2": "opencv-contrib-python-headless", "PIL": "pillow", "pillow_heif": "pillow-heif",
-        "yaml": "pyyaml", "flip_evaluator": "flip-evaluator", "pydantic_core": "pydantic",
+        "yaml": "pyyaml", "pydantic_core": "pydantic",
     }  # fmt: skip
-    optional = {"torch", "torchmetrics", "gsplat"}
+    optional = {"torch", "torchmetrics", "gsplat", "pyinstrument"}
     imported = set()
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

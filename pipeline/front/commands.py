@@ -27,6 +27,7 @@ def run(
     dry_run: bool = False,
     verify: bool = False,
     share: Share | None = None,
+    profile: bool = False,
     reporter: Reporter | None = None,
 ) -> RunSummary:
     """Run the pipeline on photographs, reusing every result that is still valid.
@@ -45,6 +46,8 @@ def run(
         share: who may read the workspace: ``nobody`` else, or the owner's ``group``; None: as it is
             said of the workspace already. Until the run ends, all that this process writes is kept
             from others (`pipeline.process.privacy`).
+        profile: write ``profile/STAGE.html`` into the workspace for each stage that runs: where its
+            time went.
         reporter: hears of the progress.
 
     Raises:
@@ -54,7 +57,7 @@ def run(
     request = make_request(images, workspace, preset, overrides, stages, from_stage)
     config = load_config(request.preset, request.overrides)
     reporter = reporter or Reporter()
-    runner = Runner(request, config, reporter, verify=verify)
+    runner = Runner(request, config, reporter, verify=verify, profile=profile)
     if dry_run:
         return runner.dry_run(force=force)
     with kept_for(share_for(request.workspace, share)):

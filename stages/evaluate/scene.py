@@ -14,7 +14,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View, to_uint8, write_png
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.images import pictures
-from stages.evaluate.images.perceptual import flip_map
+from stages.evaluate.images.flip import flip_map
 from stages.evaluate.images.score import COVERED, Figures, score_view
 from stages.evaluate.support import (
     SeenSurface,

@@ -20,15 +20,16 @@ class EvaluateStage(Stage):
     """Views, cameras and Gaussians -> metrics; more of them where the truth is known."""
 
     name = "evaluate"
-    version = 3
+    version = 4
     summary = "figures of input and held-out views, poses and geometry; side by side pictures"
     Config = EvaluateConfig
     requires = ("views", "cameras", "gaussians")
     optional = ("held_out", "points")
     provides = ("metrics",)
+    rehearsals = ("stages.evaluate.rehearsal:support",)
     libraries = (
         "numpy", "numba", "opencv-contrib-python-headless", "scipy", "open3d", "pycolmap",
-        "flip-evaluator", "torchmetrics", "torch",
+        "torchmetrics", "torch",
     )  # fmt: skip
 
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.rigid import exponential
+from pipeline.kernels import each, kernel
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -19,6 +20,8 @@ Bools = npt.NDArray[np.bool_]
 #: Colour, RGB, over what no photograph saw, and how much of it is mixed in.
 TINT = (230, 0, 200)
 _MIX = 0.6
+#: Points that are looked up at a time.
+_CHUNK = 16384
 #: What the tint means, for the manifest.
 LEGEND = "magenta: rendered, but seen by no input photograph; grey hatching: nothing rendered"
 
@@ -51,22 +54,44 @@ def supporting_views(
         [N] counts.
     """
     count = np.zeros(len(points), np.int64)
+    places = np.ascontiguousarray(points, np.float64)
     for surface in surfaces:
-        height, width = surface.depth.shape
-        pixels, depth = surface.camera.project(points)
-        ahead = depth > 0
-        inside = ahead & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
-        corner = np.floor(pixels[inside] - 0.5).astype(np.int64)
-        z = depth[inside]
-        agrees = np.zeros(len(z), bool)
-        for dx in (0, 1):
-            for dy in (0, 1):
-                column = np.clip(corner[:, 0] + dx, 0, width - 1)
-                row = np.clip(corner[:, 1] + dy, 0, height - 1)
-                seen = surface.depth[row, column].astype(np.float64)
-                agrees |= (seen > 0) & (np.abs(seen - z) < tolerance * z)
-        count[inside] += agrees
+        camera = surface.camera
+        each(
+            _count_chunk, -(-len(places) // _CHUNK), places,
+            np.ascontiguousarray(camera.cam_from_world, np.float64),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            np.ascontiguousarray(surface.depth, np.float32), float(tolerance), count,
+        )  # fmt: skip
     return count
+
+
+@kernel(nogil=True)
+def _count_chunk(  # type: ignore[no-untyped-def]
+    chunk, points, pose, lens, depth, tolerance, count
+):  # fmt: skip
+    """Add one to `count` of those of some points that a view sees; see `supporting_views`."""
+    height, width = depth.shape
+    for i in range(chunk * _CHUNK, min(len(points), (chunk + 1) * _CHUNK)):
+        x, y, z = points[i]
+        ahead = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if not ahead > 0:
+            continue
+        across = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+        down = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+        u, v = lens[0] * across / ahead + lens[2], lens[1] * down / ahead + lens[3]
+        if not (0 <= u < width and 0 <= v < height):
+            continue
+        left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
+        for column in (max(left, 0), min(left + 1, width - 1)):
+            for row in (max(top, 0), min(top + 1, height - 1)):
+                seen = np.float64(depth[row, column])
+                if seen > 0 and abs(seen - ahead) < tolerance * ahead:
+                    count[i] += 1
+                    break
+            else:
+                continue
+            break
 
 
 def support_map(

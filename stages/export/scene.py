@@ -59,16 +59,16 @@ class Scene:
         """[H, W, 3] uint8 as a camera sees the Gaussians, black behind."""
         return to_uint8(self.render(camera).image)
 
-    def path(self, seconds: float, fps: int, sway_degrees: float) -> list[Camera]:
-        """Cameras of the video, at the (even) size of the middle photograph."""
+    def path(self, seconds: float, fps: int, sway_degrees: float) -> tuple[list[Camera], list[int]]:
+        """Places of the video, at the (even) size of the middle photograph, and each frame's."""
         middle = self.cameras[self.orbit.middle()]
         size = (even(middle.width), even(middle.height))
         count = max(1, round(seconds * fps))
         return there_and_back(self.orbit, self.cameras, size, count, np.radians(sway_degrees))
 
     def novel_camera(self) -> Camera:
-        """A viewpoint between photographs, and above them: as far from all as one gets."""
-        tried = there_and_back(self.orbit, self.cameras, (2, 2), 60, np.radians(6.0))
+        """A viewpoint between photographs, above or below: as far from all as one gets."""
+        tried, _ = there_and_back(self.orbit, self.cameras, (2, 2), 60, np.radians(6.0))
         eyes = np.stack([camera.centre for camera in self.cameras])
         gaps = [np.linalg.norm(eyes - camera.centre, axis=1).min() for camera in tried]
         return tried[int(np.argmax(gaps))]

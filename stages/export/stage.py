@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -42,11 +41,8 @@ class ExportConfig(StageConfig):
     mesh_resolution: int = Field(
         256, ge=32, le=1024, description="voxels across what a photograph shows"
     )
-    mesh_smoothing: float = Field(
-        2.0,
-        ge=0,
-        le=20,
-        description="voxels that the Poisson refit of the fused surface evens out; 0: no refit",
+    mesh_cell: Literal[1, 2, 4, 8] = Field(
+        2, description="edge of the mesh's cells in voxels; finer detail is evened out"
     )
     mesh_views: int = Field(
         12, ge=0, le=500, description="viewpoints between the photographs that are fused as well"
@@ -84,12 +80,13 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 3
+    version = 4
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
     optional = ("points", "teeth")
     provides = ("exports",)
+    rehearsals = ("stages.export.rehearsal:surface", "stages.export.rehearsal:film")
     libraries = (
         "av",
         "numba",
@@ -109,7 +106,7 @@ class ExportStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.gaussians import write_gaussians_ply
-        from stages.export.mesh.building import MeshHere, MeshProcess, mesh_task
+        from stages.export.mesh.building import build_mesh
         from stages.export.mesh.files import write_mesh_ply, write_stl
         from stages.export.scene import assemble
 
@@ -141,24 +138,16 @@ class ExportStage(Stage):
             counts["colmap_points"] = _write_cameras(context, scene, folder, units)
         if context.has("teeth"):
             counts |= _write_teeth(context, views, scene, folder, config.frame, units)
-        task = None
+        mesh = None
         if config.mesh:
-            task = mesh_task(
-                scene, config.mesh_method, config.mesh_resolution, config.mesh_smoothing,
+            mesh = build_mesh(
+                scene, config.mesh_method, config.mesh_resolution, config.mesh_cell,
                 config.mesh_views, config.mesh_depth, config.mesh_confidence, config.mesh_faces,
                 context.progress,
             )  # fmt: skip
-        maker: MeshHere | MeshProcess
-        if task is None or context.threads == 1:
-            maker = MeshHere(task)
-        else:
-            maker = MeshProcess(task, context.scratch)
-        with maker as making:
-            frames = _write_video(context, scene, folder) if config.video else None
-            page_bytes = _write_page(context, scene, folder) if config.viewer else 0
-            context.progress("mesh", 0, 1)
-            mesh = making.result()
             context.progress("mesh", 1, 1)
+        frames = _write_video(context, scene, folder) if config.video else None
+        page_bytes = _write_page(context, scene, folder) if config.viewer else 0
         if mesh is not None:
             write_mesh_ply(folder / "mesh.ply", mesh)
             write_stl(folder / "mesh.stl", mesh)
@@ -232,18 +221,26 @@ def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 
 def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
-    from stages.export.pictures.video import write_video
+    from stages.export.page import rasterizer_constants
+    from stages.export.pictures.frames import FramePainter
+    from stages.export.pictures.video import Video
 
     config: ExportConfig = context.config
-    path = scene.path(config.video_seconds, config.video_fps, config.video_sway)
-
-    def frames() -> Iterator[npt.NDArray[np.uint8]]:
-        for index, camera in enumerate(path):
-            context.progress("video", index, len(path))
-            yield scene.picture(camera)
-
-    size = (path[0].width, path[0].height)
-    return write_video(folder / "orbit.mp4", frames(), size, config.video_fps, config.video_crf)
+    places, place_of_frame = scene.path(config.video_seconds, config.video_fps, config.video_sway)
+    last = {place: index for index, place in enumerate(place_of_frame)}
+    near = rasterizer_constants(scene.gaussians, scene.cameras)["near"]
+    paint = FramePainter(scene.gaussians, near, context.threads)
+    size = (places[0].width, places[0].height)
+    kept: dict[int, npt.NDArray[np.uint8]] = {}  # what the way back shows again
+    file = folder / "orbit.mp4"
+    with Video(file, size, config.video_fps, config.video_crf, context.threads > 1) as video:
+        for index, place in enumerate(place_of_frame):
+            context.progress("video", index, len(place_of_frame))
+            frame = kept.pop(place) if place in kept else paint(places[place])
+            video.add(frame)
+            if index < last[place]:
+                kept[place] = frame
+    return len(place_of_frame)
 
 
 def _write_page(context: StageContext, scene: Scene, folder: Path) -> int:

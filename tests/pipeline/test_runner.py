@@ -38,6 +38,27 @@ def test_runtime_fields_and_threads_are_not_in_the_key(run: Any) -> None:
     assert run("scale.log_every=7", "threads=1") == ALL_CACHED
 
 
+def test_a_profile_changes_no_key_and_is_whole(run: Any, toys: Path) -> None:
+    pytest.importorskip("pyinstrument")
+    run(stages=["read"])
+    assert run(profile=True) == {**ALL_RAN, "read": "cached"}
+    assert run() == ALL_CACHED
+    pages = sorted((toys / "w" / "profile").iterdir())
+    assert [page.name for page in pages] == ["count.html", "publish.html", "scale.html"]
+    text = pages[0].read_text(encoding="utf-8")
+    assert "toy.py" in text
+    assert "https://" not in text, "nothing is loaded from the network"
+
+
+def test_a_missing_profiler_is_said_first(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.installed.is_installed", lambda *_: False)
+    with pytest.raises(pipeline.RequestError, match=r"--profile needs pyinstrument.*\[profile\]"):
+        run(profile=True)
+    assert not (toys / "w").exists()
+
+
 def test_early_cut_off_when_the_bytes_stay_the_same(run: Any) -> None:
     run()
     after = run("scale.round=true")  # 2.0 rounds to 2: other config, same numbers

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,8 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rigid import exponential
 from stages.evaluate.geometry import geometry_figures
 from stages.evaluate.held_out import register
-from stages.evaluate.images.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights, flip_map
+from stages.evaluate.images.flip import flip_map
+from stages.evaluate.images.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights
 from stages.evaluate.support import (
     TINT,
     SeenSurface,
@@ -220,6 +222,17 @@ def test_flip_of_equal_and_of_opposite_pictures() -> None:
     left = image.copy()
     left[:, :4] = 255 - left[:, :4]
     assert flip_map(left, image)[:, :4].mean() > 5 * flip_map(left, image)[:, 24:].mean()
+
+
+def test_flip_agrees_with_its_authors_program() -> None:
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    random = np.random.default_rng(1)
+    coarse = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+    image, truth = (cv2.resize(picture, (120, 90)) for picture in coarse)
+    truth[:20] = image[:20] + random.integers(0, 3, (20, 120, 3)).astype(np.uint8)
+    pair = [picture.astype(np.float32) / 255 for picture in (truth, image)]
+    wanted, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
+    np.testing.assert_allclose(flip_map(image, truth), wanted[..., 0], atol=1e-4)
 
 
 def random_vgg(seed: int) -> dict[str, Any]:

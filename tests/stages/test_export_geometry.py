@@ -112,7 +112,9 @@ def test_look_at_keeps_up_upwards_and_does_not_mirror() -> None:
 def test_the_path_passes_through_the_cameras_and_loops_smoothly() -> None:
     cameras = scene.ball_cameras()
     orbit = find_orbit(cameras, [3.0] * 3)
-    path = there_and_back(orbit, cameras, (64, 48), 200, 0.0)
+    places, place_of_frame = there_and_back(orbit, cameras, (64, 48), 200, 0.0)
+    assert len(places) == 101 and place_of_frame[0] == 50, "from the middle, and back as there"
+    path = [places[index] for index in place_of_frame]
     eyes = np.stack([camera.centre for camera in path])
     for camera in cameras:
         nearest = np.linalg.norm(eyes - camera.centre, axis=1).argmin()
@@ -141,7 +143,7 @@ def test_a_path_through_many_shaky_cameras_is_smooth() -> None:
 def test_a_single_camera_still_gets_a_small_orbit() -> None:
     (camera,) = scene.ball_cameras()[1:2]
     orbit = find_orbit([camera], [None])
-    path = there_and_back(orbit, [camera], (64, 48), 20, 0.03)
+    path, _ = there_and_back(orbit, [camera], (64, 48), 20, 0.03)
     eyes = np.stack([camera.centre for camera in path])
     assert 0.1 < np.ptp(eyes[:, 0]) < 2
     assert np.isfinite(eyes).all()

@@ -1,4 +1,4 @@
-"""Perceptual image metrics: LPIPS (where VGG-16's weights are at hand) and FLIP."""
+"""LPIPS, where VGG-16's weights are at hand."""
 
 from __future__ import annotations
 
@@ -27,22 +27,6 @@ VGG_BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 #: LPIPS's normalisation of an image in -1..1.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-
-
-def flip_map(image: Image, truth: Image) -> npt.NDArray[np.float32]:
-    """FLIP per pixel (Andersson et al., HPG 2020), LDR, 67 pixels per degree; 0 is no difference.
-
-    Args:
-        image, truth: [H, W, 3] uint8 sRGB.
-
-    Returns:
-        [H, W] float32 in 0..1; the usual figure is its mean.
-    """
-    import flip_evaluator
-
-    pair = [np.ascontiguousarray(picture, np.float32) / 255 for picture in (truth, image)]
-    error, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
-    return np.asarray(error[..., 0], np.float32)
 
 
 def find_vgg_weights(given: str | None) -> Path | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 
 from stages.export.mesh.surface import Mesh, face_normals, vertex_normals
 
@@ -15,16 +14,24 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
     names = ["x", "y", "z", "nx", "ny", "nz"]
     fields = [(n, "<f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")]
     rows = np.empty(len(mesh.vertices), fields)
+    normals = vertex_normals(mesh)
     for index, (position, normal) in enumerate(zip(names[:3], names[3:], strict=True)):
         rows[position] = mesh.vertices[:, index]
-        rows[normal] = vertex_normals(mesh)[:, index]
+        rows[normal] = normals[:, index]
     eight_bit = np.clip(np.rint(mesh.colors * 255), 0, 255).astype(np.uint8)
     for index, channel in enumerate(("red", "green", "blue")):
         rows[channel] = eight_bit[:, index]
-    faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces
-    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements, byte_order="<").write(str(path))
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", (3,))])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    # plyfile writes lists one by one
+    columns = [f"property float {name}" for name in names]
+    columns += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = [
+        "ply", "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}", *columns,
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", "",
+    ]  # fmt: skip
+    path.write_bytes("\n".join(header).encode("ascii") + rows.tobytes() + faces.tobytes())
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:

@@ -1,16 +1,13 @@
-"""A triangle mesh from depth maps (TSDF) or from points (screened Poisson)."""
+"""Triangle meshes: from points (screened Poisson), repaired, simplified, cut to what is known."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
-
-from pipeline.artifacts.cameras import Camera
 
 Array = npt.NDArray[np.float64]
 
@@ -20,10 +17,6 @@ LEAST_ALPHA = 0.6
 STEEPEST_STEP = 0.03
 #: Poisson takes minutes beyond this depth.
 DEEPEST_OCTREE = 10
-#: Voxels along the edge of a block of the distance field.
-BLOCK = 8
-#: Voxels that fewer depth maps than this have seen don't count.
-LEAST_WEIGHT = 1.5
 
 
 @dataclass(frozen=True)
@@ -59,57 +52,12 @@ def trusted_depth(
     return np.where(good & (even > 0), even, np.float32(0))
 
 
-def fuse_depths(
-    frames: Iterable[tuple[Camera, npt.NDArray[np.uint8], npt.NDArray[np.float32]]],
-    voxel: float,
-    truncation: float,
-) -> Mesh:
-    """Fuse depth maps into a truncated signed distance field and extract its surface.
-
-    Curless and Levoy 1996, with Open3D's hashed volume (whose voxels are independent of each
-    other, so that the number of threads doesn't matter).
-
-    Args:
-        frames: camera, RGB image [H, W, 3], depth map [H, W] (z; 0: unknown).
-        voxel: edge length, world units.
-        truncation: distance at which the field is cut, world units.
-    """
-    import open3d
-
-    core = open3d.core
-    volume = open3d.t.geometry.VoxelBlockGrid(
-        attr_names=("tsdf", "weight", "color"),
-        attr_dtypes=(core.float32, core.float32, core.float32),
-        attr_channels=[core.SizeVector([number]) for number in (1, 1, 3)],
-        voxel_size=voxel,
-        block_resolution=BLOCK,
-        block_count=20_000,
-        device=core.Device("CPU:0"),
-    )
-    for camera, image, depth in frames:
-        # Open3D's pixel centres lie at whole numbers.
-        lens = core.Tensor.from_numpy(camera.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        pose = core.Tensor.from_numpy(np.ascontiguousarray(camera.cam_from_world))
-        farthest = 1.0 + float(depth.max())
-        depth_image = open3d.t.geometry.Image(core.Tensor.from_numpy(np.ascontiguousarray(depth)))
-        color_image = open3d.t.geometry.Image(core.Tensor.from_numpy(image.astype(np.float32)))
-        blocks = volume.compute_unique_block_coordinates(
-            depth_image, lens, pose, 1.0, farthest, truncation / voxel
-        )
-        volume.integrate(
-            blocks, depth_image, color_image, lens, lens, pose, 1.0, farthest, truncation / voxel
-        )
-    surface = volume.extract_triangle_mesh(weight_threshold=LEAST_WEIGHT)
-    mesh = _from_open3d(surface.to_legacy())
-    return Mesh(mesh.vertices, mesh.faces, mesh.colors / 255.0)
-
-
 def poisson(
     points: npt.NDArray[np.floating],
     normals: npt.NDArray[np.floating],
     colors: npt.NDArray[np.floating],
     depth: int,
-) -> tuple[Mesh, Array]:
+) -> Mesh:
     """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), on one thread: it isn't
     deterministic on more.
 
@@ -118,7 +66,7 @@ def poisson(
         depth: of the octree.
 
     Returns:
-        The (closed) mesh, and for every vertex the log2 density of points around it.
+        The (closed) mesh.
     """
     import open3d
 
@@ -127,38 +75,29 @@ def poisson(
     for name, values in (("points", points), ("normals", normals), ("colors", colors)):
         vectors = open3d.utility.Vector3dVector(np.asarray(values, np.float64)[oriented])
         setattr(cloud, name, vectors)
-    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+    mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
         cloud, depth=depth, n_threads=1
     )
-    return _from_open3d(mesh), np.asarray(density)
-
-
-def smoothed(mesh: Mesh, cell: float) -> Mesh:
-    """Refit a mesh by screened Poisson through its own vertices, where the mesh is.
-
-    It irons out the steps between views and closes small holes.
-
-    Args:
-        mesh: what to smooth.
-        cell: size of the octree's cells, world units; details smaller than that go.
-    """
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell)), 3, DEEPEST_OCTREE))
-    surface, _ = poisson(mesh.vertices, vertex_normals(mesh), mesh.colors, depth)
-    return keep_near(surface, mesh.vertices, 2 * cell)
+    return _from_open3d(mesh)
 
 
 def keep_near(mesh: Mesh, support: npt.NDArray[np.floating], reach: float) -> Mesh:
     """The part of a mesh with a point of `support` [N, 3] within `reach` of each vertex."""
-    distance, _ = cKDTree(np.asarray(support, np.float64)).query(mesh.vertices)
+    tree = _tree(np.asarray(support, np.float64))
+    distance, _ = tree.query(mesh.vertices, distance_upper_bound=np.nextafter(reach, np.inf))
     return keep_vertices(mesh, distance <= reach)
 
 
 def spacing(points: npt.NDArray[np.floating]) -> float:
     """Median distance of points [N, 3], N >= 2, to their nearest neighbours."""
     cloud = np.asarray(points, np.float64)
-    distance, _ = cKDTree(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
+    distance, _ = _tree(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
     return float(np.median(distance[:, 1]))
+
+
+def _tree(points: Array) -> cKDTree:
+    """For a few queries: what makes many fast takes longer than they do."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def keep_vertices(mesh: Mesh, kept: npt.NDArray[np.bool_]) -> Mesh:

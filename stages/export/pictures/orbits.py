@@ -181,8 +181,8 @@ def lens(cameras: Sequence[Camera], width: int, height: int) -> Camera:
 
 def there_and_back(
     orbit: Orbit, cameras: Sequence[Camera], size: tuple[int, int], count: int, sway: float
-) -> list[Camera]:
-    """A path through all cameras and back that loops without a jolt.
+) -> tuple[list[Camera], list[int]]:
+    """A path through all cameras and back that loops without a jolt, and back as there.
 
     Args:
         orbit: frame of the cameras.
@@ -190,12 +190,16 @@ def there_and_back(
         size: (width, height) in pixels.
         count: frames in one loop.
         sway: amplitude of the slow rise and fall, radians.
+
+    Returns:
+        The places from one end to the other, and the place of each frame (about two each).
     """
-    phase = 2 * np.pi * np.arange(count) / count
+    swing = np.sin(2 * np.pi * np.arange(count) / count)
+    places, place_of_frame = np.unique(np.round(swing, 9), return_inverse=True)
     low, high = orbit.span()
-    azimuths = (low + high) / 2 + (high - low) / 2 * np.sin(phase)
-    poses = path_poses(orbit, azimuths, sway * np.sin(2 * phase))
-    return _cameras(poses, lens(cameras, *size))
+    azimuths = np.asarray((low + high) / 2 + (high - low) / 2 * places, np.float64)
+    poses = path_poses(orbit, azimuths, np.asarray(sway * np.sin(np.pi * places), np.float64))
+    return _cameras(poses, lens(cameras, *size)), place_of_frame.tolist()
 
 
 def between(orbit: Orbit, cameras: Sequence[Camera], count: int) -> list[Camera]:

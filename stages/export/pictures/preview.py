@@ -10,9 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.kernels import kernel
 from stages.export.mesh.surface import Mesh, vertex_normals
 
 Pixels = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int32]
 
 GAP = 8
 CAPTION = 30
@@ -22,34 +26,59 @@ INK = (60, 60, 60)
 
 def shade_mesh(mesh: Mesh, camera: Camera) -> Pixels:
     """Picture of a mesh, lit from the camera: [H, W, 3] uint8, white where there is nothing."""
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
-        open3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
-    )
-    # Each pixel is the mean of 2 x 2 rays.
+    # Each pixel is the mean of 2 x 2.
     fine = camera.resized(2 * camera.width, 2 * camera.height)
-    rays = open3d.t.geometry.RaycastingScene.create_rays_pinhole(
-        open3d.core.Tensor.from_numpy(fine.matrix),
-        open3d.core.Tensor.from_numpy(np.ascontiguousarray(fine.cam_from_world)),
-        fine.width, fine.height,
-    )  # fmt: skip
-    answer = scene.cast_rays(rays, nthreads=1)
-    hit = np.isfinite(answer["t_hit"].numpy())
-    corners = mesh.faces[np.where(hit, answer["primitive_ids"].numpy(), 0)]  # [H, W, 3]
-    uv = answer["primitive_uvs"].numpy()
-    weights = np.stack([1 - uv.sum(-1), uv[..., 0], uv[..., 1]], -1)[..., None]
-    normals = (vertex_normals(mesh)[corners] * weights).sum(2)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-    directions = rays.numpy()[..., 3:]
-    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    facing = np.abs((normals * directions).sum(-1, keepdims=True))
-    shaded = (0.25 + 0.75 * facing) * np.array([0.93, 0.91, 0.87])
-    picture = np.where(hit[..., None], shaded, PAPER / 255)
+    points, depths = fine.project(mesh.vertices)
+    towards = fine.centre - mesh.vertices
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    facing = np.abs((vertex_normals(mesh) * towards).sum(1))
+    shown = np.full((fine.height, fine.width), -1.0, np.float32)
+    nearest = np.zeros_like(shown)
+    draw(points, depths, facing, mesh.faces, nearest, shown)
+    shaded = (0.25 + 0.75 * shown[..., None]) * np.array([0.93, 0.91, 0.87])
+    picture = np.where(shown[..., None] >= 0, shaded, PAPER / 255)
     picture = picture.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3))
     return np.asarray(np.rint(picture * 255), np.uint8)
+
+
+@kernel(nogil=True)
+def draw(points: Array, depths: Array, values: Array, faces: Ints, nearest: Floats, shown: Floats):  # type: ignore[no-untyped-def]
+    """Draw triangles with a value at each vertex, the nearest before the others.
+
+    Args:
+        points, depths, values: [V, 2] pixels, [V] z (triangles that reach behind the camera are
+            left out), [V].
+        faces: [F, 3].
+        nearest: [H, W] 1 / z of what is drawn, 0: nothing. shown: [H, W] the value there.
+    """
+    height, width = shown.shape
+    for face in range(len(faces)):
+        i, j, k = faces[face]
+        if depths[i] <= 0 or depths[j] <= 0 or depths[k] <= 0:
+            continue
+        ax, ay = points[i]
+        bx, by = points[j] - points[i]
+        cx, cy = points[k] - points[i]
+        area = bx * cy - by * cx
+        if not abs(area) > 1e-9:
+            continue
+        left = max(0, int(np.ceil(ax + min(0.0, bx, cx) - 0.5)))
+        right = min(width - 1, int(np.floor(ax + max(0.0, bx, cx) - 0.5)))
+        top = max(0, int(np.ceil(ay + min(0.0, by, cy) - 0.5)))
+        bottom = min(height - 1, int(np.floor(ay + max(0.0, by, cy) - 0.5)))
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                dx, dy = x + 0.5 - ax, y + 0.5 - ay
+                q = (dx * cy - dy * cx) / area
+                r = (bx * dy - by * dx) / area
+                if q < 0 or r < 0 or q + r > 1:
+                    continue
+                # what is linear in the world is so on the screen after division by z
+                p, q, r = (1 - q - r) / depths[i], q / depths[j], r / depths[k]
+                near = p + q + r
+                if near > nearest[y, x]:
+                    nearest[y, x] = near
+                    shown[y, x] = (p * values[i] + q * values[j] + r * values[k]) / near
 
 
 def contact_sheet(panels: Sequence[tuple[str, Pixels]], width: int, height: int) -> Pixels:
