@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import JAWS, is_upper
+from pipeline.artifacts.dental.fdi import JAWS
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
-from stages.init.dental.numbering.ends import end_labels, ends_cost, hidden_at_ends
+from stages.init.dental.numbering.ends import end_labels, ends_cost
 from stages.init.dental.numbering.hypotheses import (
     FINAL_STEPS,
     SEARCH_STEPS,
@@ -22,9 +22,8 @@ from stages.init.dental.numbering.hypotheses import (
     Scorer,
     ViewLabels,
     contiguous,
-    row_defects,
 )
-from stages.init.dental.template import POSITIONS, position_of, tooth_at
+from stages.init.dental.template import POSITIONS, tooth_at
 
 Array = npt.NDArray[np.float64]
 Fixed = dict[tuple[int, int, int], int]
@@ -237,13 +236,8 @@ def row_trial(
         max_steps=TRIAL_STEPS,
         tolerance=0.05,
     )
-    options = scorer.options
-    total = adjusted.evidence + options.unused_cost * scorer.cache.unused(view, labels)
+    total = adjusted.evidence + scorer.row_costs(view, labels, labelling.absent)
     total += ends_cost(scorer.rows, (view,), (labels,), adjusted)
-    for jaw in (0, 1):
-        absent = frozenset(position_of(t) for t in labelling.absent if is_upper(t) == (jaw == 0))
-        total += options.defect_cost * row_defects(labels[jaw], absent)
-        total += options.hidden_cost * hidden_at_ends(labels[jaw], absent)
     one = replace(labelling, views=(view,), roles=(role,), labels=(labels,))
     return total + scorer.looks(one)
 
