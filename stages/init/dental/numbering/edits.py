@@ -36,6 +36,9 @@ TRIED_DEVIATION = 0.8
 JOINT_TRIALS = 12
 #: Edits of a photograph that look likeliest and are tried against the other views' arch.
 ROW_TRIALS = 24
+#: Missing teeth that look likeliest and are solved jointly. Of those of twelve patients that were
+#: taken, or came within 15 of the best, the crowns' looks put none behind the 28th.
+MISSING_TRIALS = 32
 #: Steps of the solver for such a trial.
 TRIAL_STEPS = 6
 #: An edit must gain this much to be taken.
@@ -275,7 +278,7 @@ def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[
         jobs += [
             edit
             for edit in plausible(
-                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted)
+                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted), MISSING_TRIALS
             )
             if all(
                 _allowed(view, jaw, edit.labels[number][jaw], fixed)

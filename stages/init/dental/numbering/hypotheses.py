@@ -136,6 +136,7 @@ class Scorer:
         self.focals, self.focal_deviations = focals, focal_deviations
         self.options = options
         self.threads = threads
+        self._searched: dict[Labelling, Scored] = {}
         self.solved = 0
         side, spread = options.side_yaw, options.side_yaw_deviation
         self._yaw_of = {
@@ -237,7 +238,22 @@ class Scorer:
     def solve_all(
         self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int
     ) -> list[Scored]:
-        """Solve labellings, on several threads, in the order given."""
+        """Solve labellings, on several threads, in the order given.
+
+        In `SEARCH_STEPS` none is solved twice, whatever it starts from: the edits of labellings
+        that are near each other lead to the same ones again and again.
+        """
+        if max_steps != SEARCH_STEPS:
+            return self._solve_each(jobs, max_steps)
+        new = {job[0]: job for job in reversed(jobs) if job[0] not in self._searched}
+        fresh = list(reversed(new.values()))
+        for scored in self._solve_each(fresh, max_steps):
+            self._searched[scored.labelling] = scored
+        return [self._searched[labelling] for labelling, _ in jobs]
+
+    def _solve_each(
+        self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int
+    ) -> list[Scored]:
         for labelling, _ in jobs:
             for view, labels in zip(labelling.views, labelling.labels, strict=True):
                 self.row_costs(view, labels, labelling.absent)  # before threads share the caches
