@@ -42,8 +42,7 @@ class TeethStage(Stage):
         views = context.load("views").views
         reader = PhotographReader(views, context.threads)
         wanted = config.method != "none" and (
-            config.method == "reader"
-            or (len(views) <= config.most_views and reader.shows_teeth())
+            config.method == "reader" or (len(views) <= config.most_views and reader.shows_teeth())
         )
         if not wanted:
             size = [(view.width, view.height) for view in views]

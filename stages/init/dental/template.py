@@ -84,12 +84,9 @@ def landmark_index(jaw: Jaw, kind_start: int, position: int) -> int:
     return (0 if jaw == "upper" else LANDMARKS_A_JAW) + kind_start + position
 
 
-@lru_cache(maxsize=1)
 def is_lower_landmark() -> npt.NDArray[np.bool_]:
-    """[L] bool: which landmarks of `landmark_names` belong to the lower jaw (not to be changed)."""
-    lower = np.arange(2 * LANDMARKS_A_JAW) >= LANDMARKS_A_JAW
-    lower.flags.writeable = False
-    return lower
+    """[L] bool: which landmarks of `landmark_names` belong to the lower jaw."""
+    return np.arange(2 * LANDMARKS_A_JAW) >= LANDMARKS_A_JAW
 
 
 @lru_cache(maxsize=8)

@@ -284,9 +284,7 @@ def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
     """The labels of both rows of a view that look likeliest and that anatomy allows."""
     upper, lower = rows
     best = [best_rows(row.looks, count, LOOKS) for row in rows]
-    likeliest = sorted(
-        (cost + other, (a, b)) for (cost, a), (other, b) in product(*best)
-    )
+    likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
     pairs = []
     for _, (a, b) in likeliest:
         shift = _jaw_shift(upper, lower, a, b)
