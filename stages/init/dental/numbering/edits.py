@@ -187,13 +187,13 @@ def plausible(
     """Those of some labellings that the crowns' looks don't rule out beside the present one.
 
     Args:
-        most: so many that look likeliest, in their order; None: all.
+        most: so many that look likeliest, in their order, and all that look like the last of them
+            (without looks, all); None: all.
     """
     limit = scorer.looks(now) + LOOKS_WINDOW
     looks = [scorer.looks(edit) for edit in edits]
-    if most is not None and len(looks) > most:
-        limit = min(limit, sorted(looks)[most])
-    return [edit for edit, cost in zip(edits, looks, strict=True) if cost < limit]
+    worst = sorted(looks)[most - 1] if most is not None and len(looks) > most else limit
+    return [edit for edit, cost in zip(edits, looks, strict=True) if cost < limit and cost <= worst]
 
 
 def common_mouth(scorer: Scorer, scored: Scored) -> list[float]:
