@@ -129,14 +129,14 @@ def _watershed(inside: Map, mask: npt.NDArray[np.bool_]) -> Labels:
     height = np.where(mask, smooth + np.float32(1e-4) * depth, -1).astype(np.float32)
     rows, columns = mask.shape
     padded = np.pad(height, 1, constant_values=-1)
-    parent = np.arange(mask.size).reshape(mask.shape)
+    steepest = np.arange(mask.size).reshape(mask.shape)
     highest = height.copy()
     for i, j in _NEIGHBOURS:
         neighbour = padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
         up = mask & (neighbour > highest)
         highest[up] = neighbour[up]
-        parent[up] = np.flatnonzero(up) + (i * columns + j)
-    parent = parent.ravel()
+        steepest[up] = np.flatnonzero(up) + (i * columns + j)
+    parent = steepest.ravel()
     while True:
         further = parent[parent]
         if np.array_equal(further, parent):
