@@ -199,8 +199,8 @@ class Runner:
             self._fits.append(fit_arch(*args, **kwargs))
             return self._fits[-1]
 
-        def kept_reading(image: Any, valid: Any, name: str, *rest: Any) -> Reading:
-            made = self._reading(lambda: read_photograph(image, valid, name, *rest), image, valid)
+        def kept_reading(image: Any, valid: Any, name: str, **rest: Any) -> Reading:
+            made = self._reading(lambda: read_photograph(image, valid, name, **rest), image, valid)
             return replace(made, dentition=replace(made.dentition, name=name))
 
         with ExitStack() as stack:

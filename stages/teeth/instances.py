@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int32]
 Map = npt.NDArray[np.float32]
 
-_NEIGHBOURS = [(0, 0)] + [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+_NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 #: The maps are brought to this many times their size first.
 _FINER = 2
 #: Standard deviation of the blur before peaks are sought, pixels of the finer maps.
@@ -83,32 +83,35 @@ def find_crowns(answer: Answer) -> list[Found]:
     small = labels[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER]
     typical = float(np.median(areas))
     crowns = []
-    for number in numbers:
+    for number, box in zip(numbers, boxes, strict=True):
         area = float(areas[number - 1])
         if area < max(LEAST_PIXELS, LEAST_AREA * typical):
             continue
-        mine = labels[boxes[number - 1]] == number
-        part = share[boxes[number - 1]]
+        mine = labels[box] == number
+        part = share[box]
         polygon = _outline(mine, part)
-        own = small == number
+        within = tuple(slice(side.start // _FINER, side.stop // _FINER + 1) for side in box)
+        own = small[within] == number
         if polygon is None or not own.any():
             continue
-        peak = float(inside[boxes[number - 1]][mine].max())
+        peak = float(inside[box][mine].max())
         score = float(part[mine].mean()) * min(1.0, peak / SURE_PEAK)
         if score < LEAST_SCORE:
             continue
-        corner = [boxes[number - 1][1].start, boxes[number - 1][0].start]
-        weight = answer.inside * own
+        corner = [box[1].start, box[0].start]
+        weight = answer.inside[within] * own
         weight = weight / max(float(weight.sum()), 1e-9)
         crowns.append(
             Found(
                 polygon=_to_image((polygon + corner) / _FINER, linear),
                 score=score,
                 area=area / scale2,
-                lower=float((answer.lower * weight).sum()),
-                left=float((answer.left * weight).sum()),
-                primary=float((answer.primary * weight).sum()),
-                position=np.asarray((answer.position * weight).sum(axis=(1, 2)), np.float64),
+                lower=float((answer.lower[within] * weight).sum()),
+                left=float((answer.left[within] * weight).sum()),
+                primary=float((answer.primary[within] * weight).sum()),
+                position=np.asarray(
+                    (answer.position[:, *within] * weight).sum(axis=(1, 2)), np.float64
+                ),
             )
         )
     return sorted(crowns, key=lambda crown: -crown.area)
@@ -126,21 +129,22 @@ def _watershed(inside: Map, mask: npt.NDArray[np.bool_]) -> Labels:
     height = np.where(mask, smooth + np.float32(1e-4) * depth, -1).astype(np.float32)
     rows, columns = mask.shape
     padded = np.pad(height, 1, constant_values=-1)
-    around = np.stack(
-        [padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns] for i, j in _NEIGHBOURS]
-    )
-    step = np.array([i * columns + j for i, j in _NEIGHBOURS])
-    parent = (np.arange(mask.size) + step[around.argmax(axis=0)].ravel()).astype(np.int64)
-    parent[~mask.ravel()] = np.flatnonzero(~mask.ravel())
+    steepest = np.arange(mask.size).reshape(mask.shape)
+    highest = height.copy()
+    for i, j in _NEIGHBOURS:
+        neighbour = padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
+        up = mask & (neighbour > highest)
+        highest[up] = neighbour[up]
+        steepest[up] = np.flatnonzero(up) + (i * columns + j)
+    parent = steepest.ravel()
     while True:
         further = parent[parent]
         if np.array_equal(further, parent):
             break
         parent = further
-    _, regions = np.unique(np.where(mask.ravel(), parent, -1), return_inverse=True)
+    peaks = (parent == np.arange(mask.size)) & mask.ravel()
+    regions = np.where(mask.ravel(), np.cumsum(peaks)[parent], 0)
     labels = regions.reshape(mask.shape).astype(np.int32)
-    if mask.all():
-        labels += 1
     owner = _merged(labels, smooth, int(labels.max()))
     return _largest_pieces(np.asarray(owner[labels], np.int32))
 
@@ -180,14 +184,13 @@ def _largest_pieces(labels: Labels) -> Labels:
     """Numbers 1..n; of each region its largest connected piece."""
     result = np.zeros_like(labels)
     number = 0
-    for value in np.unique(labels):
-        if value == 0:
+    for value, box in enumerate(ndimage.find_objects(labels), 1):
+        if box is None:
             continue
-        pieces, count = ndimage.label(labels == value)
+        number += 1
+        pieces, _ = ndimage.label(labels[box] == value)
         sizes = np.bincount(pieces.ravel())[1:]
-        if count:
-            number += 1
-            result[pieces == 1 + int(np.argmax(sizes))] = number
+        result[box][pieces == 1 + int(np.argmax(sizes))] = number
     return result
 
 

@@ -7,8 +7,8 @@ threads.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +58,14 @@ class Answer:
     answer_from_image: Transform
 
 
-@cache
+_of_thread = threading.local()
+
+
 def _network() -> Any:
-    return cv2.dnn.readNetFromONNX(str(WEIGHTS))
+    """The network of this thread: one can't be asked by two."""
+    if not hasattr(_of_thread, "network"):
+        _of_thread.network = cv2.dnn.readNetFromONNX(str(WEIGHTS))
+    return _of_thread.network
 
 
 def fitted(shape: tuple[int, int]) -> Transform:

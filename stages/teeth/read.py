@@ -61,6 +61,7 @@ def read_photograph(
     name: str,
     options: ChainOptions | None = None,
     quarters: int = 0,
+    glances: Glances | None = None,
 ) -> Reading:
     """Find the crowns in one photograph.
 
@@ -71,13 +72,14 @@ def read_photograph(
         options: of the numbers.
         quarters: of a turn anticlockwise that bring the photograph upright, unless it clearly looks
             otherwise.
+        glances: at it, where some were taken before.
 
     Returns:
         The reading, in pixels of the photograph.
     """
     height, width = image.shape[:2]
     size = (width, height)
-    first, crowns = _first_look(image, valid, quarters)
+    first, crowns = _first_look(glances or Glances(image, valid), quarters)
     answer = first
     if len(crowns) >= _LEAST_CROWNS:
         closer = look(image, valid, _closer(crowns), flip=True)
@@ -95,25 +97,41 @@ def read_photograph(
     return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
 
 
-def _first_look(image: Array32, valid: Bool, quarters: int) -> tuple[Answer, list[Found]]:
+class Glances:
+    """Looks at a whole photograph, upright or turned by quarters; each is taken once.
+
+    Args:
+        image: [H, W, 3] float32 sRGB in 0..1.
+        valid: [H, W] bool: nothing is read outside.
+    """
+
+    def __init__(self, image: Array32, valid: Bool) -> None:
+        self._image, self._valid = image, valid
+        self._taken: dict[int, tuple[Answer, list[Found]]] = {}
+
+    def turned(self, quarters: int) -> tuple[Answer, list[Found]]:
+        """What it shows turned anticlockwise by some quarters of a turn."""
+        quarters %= 4
+        if quarters not in self._taken:
+            transform = _quarter_turned(self._image.shape[:2], quarters)
+            answer = look(self._image, self._valid, transform, flip=False)
+            self._taken[quarters] = answer, find_crowns(answer)
+        return self._taken[quarters]
+
+
+def _first_look(glances: Glances, quarters: int) -> tuple[Answer, list[Found]]:
     """The whole photograph, the right way up if that is clear."""
-    answer, crowns = look_turned(image, valid, quarters)
+    answer, crowns = glances.turned(quarters)
     upright = uprightness(answer, crowns)
     if len(crowns) < _LEAST_CROWNS or upright > _UPRIGHT:
         return answer, crowns
     least = upright + _MORE_UPRIGHT
     for more in (1, 2, 3):
-        turned, found = look_turned(image, valid, quarters + more)
+        turned, found = glances.turned(quarters + more)
         value = uprightness(turned, found)
         if shows_both_rows(found) and value > least:
             answer, crowns, least = turned, found, value
     return answer, crowns
-
-
-def look_turned(image: Array32, valid: Bool, quarters: int) -> tuple[Answer, list[Found]]:
-    """One look at the whole photograph turned anticlockwise by some quarters of a turn."""
-    answer = look(image, valid, _quarter_turned(image.shape[:2], quarters), flip=False)
-    return answer, find_crowns(answer)
 
 
 def shows_both_rows(crowns: list[Found]) -> bool:

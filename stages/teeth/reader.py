@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 
 from pipeline.artifacts.views import View
-from stages.teeth.instances import find_crowns
-from stages.teeth.network import fitted, look
 from stages.teeth.read import (
+    Glances,
     Reading,
-    look_turned,
     read_photograph,
     shows_both_rows,
     uprightness,
 )
 
+Item = TypeVar("Item")
 Progress = Callable[[str, int, int], None]
+Map = Callable[[Callable[..., Any], Iterable[Any]], Iterable[Any]]
 
 #: So many photographs, evenly chosen, are asked whether a case is one of teeth at all; more than
 #: this share must show them.
@@ -30,51 +33,97 @@ _SURE = 0.8
 #: Photographs stand on their heads if they look so much more upright that way, on average: those of
 #: twelve patients lose .45 to .77.
 _MORE_UPRIGHT = 0.2
+#: So many photographs, evenly chosen, are asked that: a patient's agree, and many are of a film.
+_TURNED = 4
 
 
-def shows_teeth(views: Sequence[View]) -> bool:
-    """Is this a case of teeth? One quick look at a few photographs."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _ASKED)).round().astype(int))
-    votes = [_has_teeth(views[int(k)]) for k in chosen]
-    return bool(votes) and sum(votes) > _SHARE * len(votes)
+class PhotographReader:
+    """Reads the photographs of a case, each on one thread; they change nothing but the time.
 
+    Args:
+        views: the photographs.
+        threads: how many are read side by side.
+    """
 
-def _has_teeth(view: View) -> bool:
-    answer = look(view.image, view.valid(), fitted((view.height, view.width)), flip=False)
-    if float((answer.tooth > 0).mean()) < _LEAST_TOOTH:
-        return False
-    return sum(crown.score > _SURE for crown in find_crowns(answer)) >= _LEAST_CROWNS
+    def __init__(self, views: Sequence[View], threads: int) -> None:
+        self._views = views
+        self._threads = max(1, min(threads, len(views)))
+        self._glances = [Glances(view.image, view.valid()) for view in views]
+
+    def shows_teeth(self) -> bool:
+        """Is this a case of teeth? One quick look at a few photographs."""
+        with self._side_by_side() as map_:
+            votes = list(map_(_has_teeth, _evenly(self._glances, _ASKED)))
+        return bool(votes) and sum(votes) > _SHARE * len(votes)
+
+    def read(self, progress: Progress) -> list[Reading]:
+        """Read every photograph.
+
+        Photographs are turned the right way up where that is clear, each by itself or, if all were
+        taken from behind the patient's head, together; the outlines remain those of the
+        photographs.
+        """
+        with self._side_by_side() as map_:
+            readings = []
+            progress("reading teeth", 0, len(self._views))
+            for reading in map_(self._read, self._numbers()):
+                readings.append(reading)
+                progress("reading teeth", len(readings), len(self._views))
+            if self._upside_down(map_):
+                readings = list(map_(lambda k: self._read(k, quarters=2), self._numbers()))
+        return readings
+
+    def _numbers(self) -> Iterable[int]:
+        return range(len(self._views))
+
+    def _read(self, number: int, quarters: int = 0) -> Reading:
+        view = self._views[number]
+        return read_photograph(
+            view.image, view.valid(), view.name, quarters=quarters, glances=self._glances[number]
+        )
+
+    def _upside_down(self, map_: Map) -> bool:
+        """Do the photographs stand on their heads, by some that show both rows of teeth?"""
+        upright = [g for g in self._glances if shows_both_rows(g.turned(0)[1])]
+        found = map_(_gain_upside_down, _evenly(upright, _TURNED))
+        gains = [gain for gain in found if gain is not None]
+        return bool(gains) and float(np.mean(gains)) > _MORE_UPRIGHT
+
+    @contextmanager
+    def _side_by_side(self) -> Iterator[Map]:
+        """Map over photographs in threads, OpenCV keeping to one in each."""
+        before = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        try:
+            with ThreadPoolExecutor(self._threads) as pool:
+                yield pool.map
+        finally:
+            cv2.setNumThreads(before)
 
 
 def read_photographs(views: Sequence[View], threads: int, progress: Progress) -> list[Reading]:
-    """Read every photograph; the result does not depend on the number of threads.
-
-    Photographs are turned the right way up where that is clear, each by itself or, if all were
-    taken from behind the patient's head, together; the outlines remain those of the photographs.
-    """
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(max(1, threads))
-    try:
-        readings = []
-        for number, view in enumerate(views):
-            progress("reading teeth", number, len(views))
-            readings.append(read_photograph(view.image, view.valid(), view.name))
-        if _upside_down(views):
-            readings = [
-                read_photograph(view.image, view.valid(), view.name, quarters=2) for view in views
-            ]
-        progress("reading teeth", len(views), len(views))
-        return readings
-    finally:
-        cv2.setNumThreads(before)
+    """Read every photograph (`PhotographReader.read`)."""
+    return PhotographReader(views, threads).read(progress)
 
 
-def _upside_down(views: Sequence[View]) -> bool:
-    """Do the photographs stand on their heads, by those that show both rows of teeth?"""
-    gains = []
-    for view in views:
-        looks = [look_turned(view.image, view.valid(), quarters) for quarters in (0, 2)]
-        if all(shows_both_rows(crowns) for _, crowns in looks):
-            present, opposite = (uprightness(answer, crowns) for answer, crowns in looks)
-            gains.append(opposite - present)
-    return bool(gains) and float(np.mean(gains)) > _MORE_UPRIGHT
+def _evenly(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of some items, evenly chosen."""
+    if not items:
+        return []
+    chosen = np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int)
+    return [items[int(k)] for k in np.unique(chosen)]
+
+
+def _has_teeth(glances: Glances) -> bool:
+    answer, crowns = glances.turned(0)
+    if float((answer.tooth > 0).mean()) < _LEAST_TOOTH:
+        return False
+    return sum(crown.score > _SURE for crown in crowns) >= _LEAST_CROWNS
+
+
+def _gain_upside_down(glances: Glances) -> float | None:
+    """How much more upright a photograph looks turned over; None where not both rows show."""
+    answer, crowns = glances.turned(2)
+    if not shows_both_rows(crowns):
+        return None
+    return uprightness(answer, crowns) - uprightness(*glances.turned(0))

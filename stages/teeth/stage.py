@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 3
+    version = 4
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)
@@ -36,12 +36,13 @@ class TeethStage(Stage):
         from pipeline.artifacts.teeth import Dentition, Teeth
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.teeth.choose import ChoiceOptions, choose
-        from stages.teeth.reader import read_photographs, shows_teeth
+        from stages.teeth.reader import PhotographReader
 
         config: TeethConfig = context.config
         views = context.load("views").views
+        reader = PhotographReader(views, context.threads)
         wanted = config.method != "none" and (
-            config.method == "reader" or (len(views) <= config.most_views and shows_teeth(views))
+            config.method == "reader" or (len(views) <= config.most_views and reader.shows_teeth())
         )
         if not wanted:
             size = [(view.width, view.height) for view in views]
@@ -49,7 +50,7 @@ class TeethStage(Stage):
             context.save(Teeth(tuple(empty)))
             context.summarize(photographs_with_teeth=0)
             return
-        readings = read_photographs(views, context.threads, context.progress)
+        readings = reader.read(context.progress)
         options = ChoiceOptions(
             config.least_crowns, config.least_extent, config.least_colour, config.same_view,
             config.least_score,

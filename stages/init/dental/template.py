@@ -89,8 +89,12 @@ def is_lower_landmark() -> npt.NDArray[np.bool_]:
     return np.arange(2 * LANDMARKS_A_JAW) >= LANDMARKS_A_JAW
 
 
+@lru_cache(maxsize=8)
 def _arch_curve(half_width: float, depth: float, length: float) -> tuple[Array, Array, Array]:
-    """Arc length, x and z of half an arch from the midline backwards, [4000] each."""
+    """Arc length, x and z of half an arch from the midline backwards, [4000] each.
+
+    Not to be written to: they are cached.
+    """
     t = np.linspace(0.0, np.pi / 2, 4000)
     x = half_width * np.sin(t) ** 0.9
     z = -depth * (1 - np.cos(t) ** 1.15)
@@ -98,12 +102,14 @@ def _arch_curve(half_width: float, depth: float, length: float) -> tuple[Array, 
     return arc * (length / arc[-1]), x, z
 
 
+@lru_cache(maxsize=256)
 def _half_jaw(jaw: Jaw, absent: frozenset[int], primary: frozenset[int]) -> Array:
-    """Landmarks of a jaw's left half: [4, 8, 3] by kind and position from the midline.
+    """Landmarks of a jaw's left half: [4, 7, 3] by kind and position from the midline.
 
     Absent and primary teeth are named by their index from the midline, from 0.
 
-    Of papillae and embrasures, position i is the mesial one of tooth i.
+    Of papillae and embrasures, position i is the mesial one of tooth i. Not to be written to: it is
+    cached, for the hypotheses of a search differ in one half of a jaw.
     """
     upper = jaw == "upper"
     usual = [PRIMARY_WIDTHS[jaw][i] if i in primary else w for i, w in enumerate(WIDTHS[jaw])]
@@ -147,6 +153,7 @@ def _half_jaw(jaw: Jaw, absent: frozenset[int], primary: frozenset[int]) -> Arra
         for kind in (0, 1):
             up = towards_gum * shares[kind] * height + level
             points[2 + kind, i] = base - depths[kind] * inset + [0, up, 0]
+    points.flags.writeable = False
     return points
 
 

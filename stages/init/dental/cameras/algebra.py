@@ -93,12 +93,15 @@ def solve_cholesky(L, b, out):  # type: ignore[no-untyped-def]
     nogil=True,
 )
 def eliminate(H, b, H_own, b_own, H_cross, damping, S, s, own_inverse):  # type: ignore[no-untyped-def]
-    """Schur complement over the landmarks; returns their part of the log determinant."""
+    """Schur complement over the landmarks; returns their part of the log determinant.
+
+    Of S the lower half, which is what `cholesky` reads.
+    """
     n = len(b)
     log_determinant = 0.0
     for k in range(n):
         s[k] = b[k]
-        for l in range(n):
+        for l in range(k + 1):
             S[k, l] = H[k, l]
         S[k, k] *= 1 + damping
     A = np.empty((3, 3))
@@ -141,7 +144,7 @@ def eliminate(H, b, H_own, b_own, H_cross, damping, S, s, own_inverse):  # type:
             k = used[m]
             p0, p1, p2 = product[m, 0], product[m, 1], product[m, 2]
             s[k] -= p0 * b_own[i, 0] + p1 * b_own[i, 1] + p2 * b_own[i, 2]
-            for q in range(count):
+            for q in range(m + 1):
                 cross = H_cross[i, used[q]]
                 S[k, used[q]] -= p0 * cross[0] + p1 * cross[1] + p2 * cross[2]
     return log_determinant

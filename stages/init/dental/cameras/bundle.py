@@ -226,7 +226,10 @@ def adjust(
     else:
         unknowns, offsets = start[0].copy(), start[1].copy()
     # Only the landmarks seen enter: an unseen one stays on the arch and adds nothing.
-    seen, compact = np.unique(sightings.landmark, return_inverse=True)
+    enters = np.zeros(len(template), np.bool_)
+    enters[sightings.landmark] = True
+    seen = np.flatnonzero(enters)
+    compact = (np.cumsum(enters) - 1)[sightings.landmark]
     seen_offsets = np.ascontiguousarray(offsets[seen])
     angles = np.radians(priors.angle_deviations)
 
@@ -248,7 +251,7 @@ def adjust(
         matches = NO_MATCHES
     reduced = np.empty((size, size))
     cost, log_determinant = minimise(
-        unknowns, seen_offsets, sightings.view, compact.astype(np.int64), sightings.pixels,
+        unknowns, seen_offsets, sightings.view, compact, sightings.pixels,
         sightings.deviations, np.ascontiguousarray(template[seen]), is_lower_landmark()[seen],
         float(landmark_deviation), nominal, angles, float(priors.distance),
         float(priors.distance_deviation), priors.focals, focal_deviations, matches.pairs,

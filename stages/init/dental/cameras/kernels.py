@@ -60,7 +60,10 @@ def add_landmarks(  # type: ignore[no-untyped-def]
     rotations, centres, lens, jacobians, angle_deviations, focal_deviations, derive,
     H, b, H_own, b_own, H_cross,
 ):  # fmt: skip
-    """Cost of the landmarks; their part of the normal equations where `derive`."""
+    """Cost of the landmarks; their part of the normal equations where `derive`.
+
+    H must come symmetric: its lower half is added to, and mirrored.
+    """
     cost = 0.0
     arch = PER_VIEW * views
     d_point = np.zeros((2, 3))
@@ -123,7 +126,7 @@ def add_landmarks(  # type: ignore[no-untyped-def]
             for k in range(PER_VIEW + PER_ARCH):
                 value = weight * row[r, k]
                 b[columns[k]] += value * residual
-                for l in range(PER_VIEW + PER_ARCH):
+                for l in range(k + 1):
                     H[columns[k], columns[l]] += value * row[r, l]
                 for a in range(3):
                     H_cross[i, columns[k], a] += value * own[r, a]
@@ -131,6 +134,10 @@ def add_landmarks(  # type: ignore[no-untyped-def]
                 b_own[i, a] += weight * own[r, a] * residual
                 for c in range(3):
                     H_own[i, a, c] += weight * own[r, a] * own[r, c]
+    if derive:
+        for k in range(len(H)):
+            for l in range(k):
+                H[l, k] = H[k, l]
     return cost
 
 

@@ -166,4 +166,7 @@ def minimise(  # type: ignore[no-untyped-def]
             finished = True
     log_determinant = eliminate(free_H, free_b, H_own, b_own, free_cross, 0.0, S, s, own_inverse)
     log_determinant += cholesky(S, L)
+    for k in range(m):
+        for l in range(k):
+            S[l, k] = S[k, l]
     return cost, log_determinant

@@ -53,6 +53,7 @@ from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, p
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
+from stages.init.parallel import in_threads
 
 __all__ = ["ArchOptions", "fit_arch"]
 
@@ -357,10 +358,13 @@ def _refine(
     progress: Progress,
 ) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
     """Rounds of dense matches on the unrolled arch and bundle adjustment."""
-    photos = [
-        prepare_photo(image, use, dentition.mask, dentition.roll, dentition.band_height)
-        for image, use, dentition in zip(images, valid, dentitions, strict=True)
-    ]
+    photos = in_threads(
+        lambda photo: prepare_photo(
+            photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
+        ),
+        zip(images, valid, dentitions, strict=True),
+        scorer.threads,
+    )
     pairs: dict[tuple[int, int], PairFigures] = {}
     # With cameras that are known, matches can only speak for or against them.
     rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds

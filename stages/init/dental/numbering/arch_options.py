@@ -43,8 +43,9 @@ class ArchOptions:
     hidden_cost: float = 1.5
     #: Weight of what the crowns look like beside where they lie.
     looks_weight: float = 1.0
-    #: Labellings of a photograph's rows that look likeliest and are tried.
-    rows_tried: int = 40
+    #: Labellings of a photograph's rows that look likeliest and are tried. (With 40 the same
+    #: numbers in twelve patients, and confidences that differ by .013 at most.)
+    rows_tried: int = 16
     #: Labellings kept per photograph, and jointly, while searching.
     candidates_per_view: int = 10
     beam: int = 16

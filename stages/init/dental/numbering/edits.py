@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import JAWS, is_upper
+from pipeline.artifacts.dental.fdi import JAWS
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
-from stages.init.dental.numbering.ends import end_labels, ends_cost, hidden_at_ends
+from stages.init.dental.numbering.ends import end_labels, ends_cost
 from stages.init.dental.numbering.hypotheses import (
     FINAL_STEPS,
     SEARCH_STEPS,
@@ -22,9 +22,8 @@ from stages.init.dental.numbering.hypotheses import (
     Scorer,
     ViewLabels,
     contiguous,
-    row_defects,
 )
-from stages.init.dental.template import POSITIONS, position_of, tooth_at
+from stages.init.dental.template import POSITIONS, tooth_at
 
 Array = npt.NDArray[np.float64]
 Fixed = dict[tuple[int, int, int], int]
@@ -37,6 +36,9 @@ TRIED_DEVIATION = 0.8
 JOINT_TRIALS = 12
 #: Edits of a photograph that look likeliest and are tried against the other views' arch.
 ROW_TRIALS = 24
+#: Missing teeth that look likeliest and are solved jointly. Of those of twelve patients that were
+#: taken, or came within 15 of the best, the crowns' looks put none behind the 28th.
+MISSING_TRIALS = 32
 #: Steps of the solver for such a trial.
 TRIAL_STEPS = 6
 #: An edit must gain this much to be taken.
@@ -185,13 +187,13 @@ def plausible(
     """Those of some labellings that the crowns' looks don't rule out beside the present one.
 
     Args:
-        most: so many that look likeliest, in their order; None: all.
+        most: so many that look likeliest, in their order, and all that look like the last of them
+            (without looks, all); None: all.
     """
     limit = scorer.looks(now) + LOOKS_WINDOW
     looks = [scorer.looks(edit) for edit in edits]
-    if most is not None and len(looks) > most:
-        limit = min(limit, sorted(looks)[most])
-    return [edit for edit, cost in zip(edits, looks, strict=True) if cost < limit]
+    worst = sorted(looks)[most - 1] if most is not None and len(looks) > most else limit
+    return [edit for edit, cost in zip(edits, looks, strict=True) if cost < limit and cost <= worst]
 
 
 def common_mouth(scorer: Scorer, scored: Scored) -> list[float]:
@@ -237,13 +239,8 @@ def row_trial(
         max_steps=TRIAL_STEPS,
         tolerance=0.05,
     )
-    options = scorer.options
-    total = adjusted.evidence + options.unused_cost * scorer.cache.unused(view, labels)
+    total = adjusted.evidence + scorer.row_costs(view, labels, labelling.absent)
     total += ends_cost(scorer.rows, (view,), (labels,), adjusted)
-    for jaw in (0, 1):
-        absent = frozenset(position_of(t) for t in labelling.absent if is_upper(t) == (jaw == 0))
-        total += options.defect_cost * row_defects(labels[jaw], absent)
-        total += options.hidden_cost * hidden_at_ends(labels[jaw], absent)
     one = replace(labelling, views=(view,), roles=(role,), labels=(labels,))
     return total + scorer.looks(one)
 
@@ -281,7 +278,7 @@ def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[
         jobs += [
             edit
             for edit in plausible(
-                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted)
+                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted), MISSING_TRIALS
             )
             if all(
                 _allowed(view, jaw, edit.labels[number][jaw], fixed)

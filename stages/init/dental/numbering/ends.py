@@ -7,10 +7,11 @@ wide as a molar is no premolar, and one that begins where a premolar does is no 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
-import numpy as np
-
+from pipeline.artifacts.dental.fdi import Jaw
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted
 from stages.init.dental.numbering.sightings import SeenRow
@@ -47,28 +48,33 @@ def ends_cost(
         ]
         if not ends:
             continue
-        points = [
-            adjusted.points[landmark_index(row.jaw, PAPILLA, papilla)]
+        papillae = [
+            landmark
             for row, _, label, outward in ends
-            for papilla in _papillae(label, outward)
+            for landmark in _papilla_landmarks(row.jaw, label, outward)
         ]
-        x = adjusted.project(number, np.array(points))[:, 0].reshape(-1, 2)
-        for (row, end, label, outward), (inner, outer) in zip(ends, x, strict=True):
+        x = adjusted.project(number, adjusted.points[papillae])[:, 0].tolist()
+        for k, (row, end, label, outward) in enumerate(ends):
             # Nothing bounds the last tooth: a wisdom tooth may stand behind it.
             bounded = 0 <= label + outward < POSITIONS
-            total += _end_cost(row, end, outward, inner, outer if bounded else outward * np.inf)
+            outer = x[2 * k + 1] if bounded else outward * math.inf
+            total += _end_cost(row, end, outward, x[2 * k], outer)
     return total
 
 
-def _papillae(label: int, outward: int) -> tuple[int, int]:
-    """Those of a tooth, towards the row's middle and outward (any where there is none)."""
+@lru_cache(maxsize=256)
+def _papilla_landmarks(jaw: Jaw, label: int, outward: int) -> tuple[int, int]:
+    """The landmarks of a tooth's papillae, towards the row's middle and outward (any where there is
+    none)."""
     inner, outer = min(label, label - outward), min(label, label + outward)
-    return inner, min(max(outer, 0), POSITIONS - 2)
+    within = inner, min(max(outer, 0), POSITIONS - 2)
+    first, second = (landmark_index(jaw, PAPILLA, papilla) for papilla in within)
+    return first, second
 
 
 def _end_cost(row: SeenRow, end: int, outward: int, inner: float, outer: float) -> float:
     """Cost of what a crown shows beyond the place of its tooth."""
-    seen = (row.lefts[end], row.rights[end])
+    seen = (float(row.lefts[end]), float(row.rights[end]))
     seen_inner, seen_outer = seen if outward > 0 else seen[::-1]
     before = outward * (inner - seen_inner) / row.band - INNER_SLACK
     beyond = outward * (seen_outer - outer) / row.band - OUTER_SLACK

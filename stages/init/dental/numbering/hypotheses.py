@@ -130,9 +130,13 @@ class Scorer:
         self.primary = primary
         self.held = held
         self.cache = SightingCache(rows)
+        # A search asks for the same rows thousands of times.
+        self._looks: dict[tuple[int, int, Labels], float] = {}
+        self._row_costs: dict[tuple[int, int, Labels, frozenset[int]], float] = {}
         self.focals, self.focal_deviations = focals, focal_deviations
         self.options = options
         self.threads = threads
+        self._searched: dict[Labelling, Scored] = {}
         self.solved = 0
         side, spread = options.side_yaw, options.side_yaw_deviation
         self._yaw_of = {
@@ -164,24 +168,45 @@ class Scorer:
     def looks(self, labelling: Labelling) -> float:
         """What the looks of the crowns speak against a labelling (evidence)."""
         return self.options.looks_weight * sum(
-            looks_cost(self.rows[view][jaw], labels[jaw])
+            self._looks_of_row(view, jaw, labels[jaw])
             for view, labels in zip(labelling.views, labelling.labels, strict=True)
             for jaw in (0, 1)
         )
+
+    def _looks_of_row(self, view: int, jaw: int, labels: Labels) -> float:
+        key = (view, jaw, labels)
+        if key not in self._looks:
+            self._looks[key] = looks_cost(self.rows[view][jaw], labels)
+        return self._looks[key]
+
+    def row_costs(self, view: int, labels: ViewLabels, absent: frozenset[int]) -> float:
+        """What both rows of a view cost whatever the cameras are, their looks apart.
+
+        Args:
+            view: which.
+            labels: of its rows.
+            absent: FDI numbers of teeth that are missing in the patient.
+        """
+        return sum(self._costs_of_row(view, jaw, labels[jaw], absent) for jaw in (0, 1))
+
+    def _costs_of_row(self, view: int, jaw: int, labels: Labels, absent: frozenset[int]) -> float:
+        key = (view, jaw, labels, absent)
+        if key not in self._row_costs:
+            options = self.options
+            places = frozenset(position_of(t) for t in absent if is_upper(t) == (jaw == 0))
+            self._row_costs[key] = (
+                options.unused_cost * self.cache.unused(view, jaw, labels)
+                + options.defect_cost * row_defects(labels, places)
+                + options.hidden_cost * hidden_at_ends(labels, places)
+            )
+        return self._row_costs[key]
 
     def costs(self, labelling: Labelling) -> float:
         """What a labelling costs before it is solved."""
         options = self.options
         total = options.missing_cost * len(labelling.absent) + self.looks(labelling)
-        absent = (
-            frozenset(position_of(t) for t in labelling.absent if is_upper(t)),
-            frozenset(position_of(t) for t in labelling.absent if not is_upper(t)),
-        )
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
-            total += options.unused_cost * self.cache.unused(view, labels)
-            for jaw in (0, 1):
-                total += options.defect_cost * row_defects(labels[jaw], absent[jaw])
-                total += options.hidden_cost * hidden_at_ends(labels[jaw], absent[jaw])
+            total += self.row_costs(view, labels, labelling.absent)
         if len(self.rows) == 3 and options.order is None:
             total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
         return total
@@ -213,10 +238,25 @@ class Scorer:
     def solve_all(
         self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int
     ) -> list[Scored]:
-        """Solve labellings, on several threads, in the order given."""
+        """Solve labellings, on several threads, in the order given.
+
+        In `SEARCH_STEPS` none is solved twice, whatever it starts from: the edits of labellings
+        that are near each other lead to the same ones again and again.
+        """
+        if max_steps != SEARCH_STEPS:
+            return self._solve_each(jobs, max_steps)
+        new = {job[0]: job for job in reversed(jobs) if job[0] not in self._searched}
+        fresh = list(reversed(new.values()))
+        for scored in self._solve_each(fresh, max_steps):
+            self._searched[scored.labelling] = scored
+        return [self._searched[labelling] for labelling, _ in jobs]
+
+    def _solve_each(
+        self, jobs: list[tuple[Labelling, tuple[Array, Array] | None]], max_steps: int
+    ) -> list[Scored]:
         for labelling, _ in jobs:
             for view, labels in zip(labelling.views, labelling.labels, strict=True):
-                self.cache.unused(view, labels)  # fill the cache before threads share it
+                self.row_costs(view, labels, labelling.absent)  # before threads share the caches
         if self.threads < 2 or len(jobs) < 2:
             return [self.solve(labelling, start, max_steps) for labelling, start in jobs]
         with ThreadPoolExecutor(self.threads) as pool:
@@ -244,12 +284,15 @@ def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
     """The labels of both rows of a view that look likeliest and that anatomy allows."""
     upper, lower = rows
     best = [best_rows(row.looks, count, LOOKS) for row in rows]
+    likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
     pairs = []
-    for (cost, a), (other, b) in product(*best):
+    for _, (a, b) in likeliest:
         shift = _jaw_shift(upper, lower, a, b)
         if shift is None or abs(shift) <= MAX_JAW_SHIFT:
-            pairs.append((cost + other, (a, b)))
-    return [labels for _, labels in sorted(pairs)[:count]]
+            pairs.append((a, b))
+            if len(pairs) == count:
+                break
+    return pairs
 
 
 def _jaw_shift(upper: SeenRow, lower: SeenRow, a: Labels, b: Labels) -> float | None:

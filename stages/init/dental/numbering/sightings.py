@@ -258,14 +258,10 @@ class SightingCache:
             )
         return self._known[key]
 
-    def unused(self, view: int, labels: tuple[Labels, Labels]) -> int:
-        """How many landmarks of a view its labels leave without a name."""
-        return sum(
-            max(
-                self.rows[view][jaw].landmark_count - len(self.of_row(view, jaw, labels[jaw])[0]), 0
-            )
-            for jaw in (0, 1)
-        )
+    def unused(self, view: int, jaw: int, labels: Labels) -> int:
+        """How many landmarks of a row its labels leave without a name."""
+        named = len(self.of_row(view, jaw, labels)[0])
+        return max(self.rows[view][jaw].landmark_count - named, 0)
 
     def collect(self, views: list[int], labels: list[tuple[Labels, Labels]]) -> Sightings:
         """Sightings of some views under their labels; views are numbered as in `views`."""

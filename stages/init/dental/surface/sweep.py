@@ -8,6 +8,7 @@ of the crown; semi-global matching along the chart decides.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -296,15 +297,44 @@ def matching_cost(
         [H, W, D] float32 in 0..1.4: mean over the pairs that both see the sample; a constant where
         there is none.
     """
-    volume = np.empty((*points.shape[:2], len(offsets)), np.float32)
-    _volume(
-        points, normals, offsets, _stack([p.texture for p in photos]),
-        np.array([p.size for p in photos], np.int64),
-        np.array([p.camera for p in photos], np.float32), np.array(pairs, np.int64),
-        np.ascontiguousarray(seen), half_window,
-        np.float32(_NEUTRAL), np.float32(_LEAST_VARIANCE), volume,
-    )  # fmt: skip
+    volume = np.full((*points.shape[:2], len(offsets)), _NEUTRAL, np.float32)
+    for first, last, compared in _stretches(seen, pairs):
+        # With a margin of half a window the costs are those of the whole chart.
+        left, right = max(first - half_window, 0), min(last + half_window, points.shape[1])
+        views = sorted({view for pair in compared for view in pair})
+        shown = [photos[view] for view in views]
+        part = np.empty((len(points), right - left, len(offsets)), np.float32)
+        _volume(
+            np.ascontiguousarray(points[:, left:right]),
+            np.ascontiguousarray(normals[:, left:right]), offsets,
+            _stack([photo.texture for photo in shown]),
+            np.array([photo.size for photo in shown], np.int64),
+            np.array([photo.camera for photo in shown], np.float32),
+            np.array([[views.index(a), views.index(b)] for a, b in compared], np.int64),
+            np.ascontiguousarray(np.asarray(seen)[views, :, left:right]), half_window,
+            np.float32(_NEUTRAL), np.float32(_LEAST_VARIANCE), part,
+        )  # fmt: skip
+        volume[:, first:last] = part[:, first - left : last - left]
     return volume
+
+
+def _stretches(
+    seen: npt.NDArray[np.bool_], pairs: list[list[int]]
+) -> list[tuple[int, int, list[list[int]]]]:
+    """First column, the one after the last, and the pairs that see something in between: a chart
+    cut where the first or last column of some pair is. What no pair sees is left out."""
+    spans = []
+    for a, b in pairs:
+        columns = np.flatnonzero((seen[a] & seen[b]).any(axis=0))
+        if len(columns):
+            spans.append((int(columns[0]), int(columns[-1]) + 1, [a, b]))
+    cuts = sorted({cut for first, last, _ in spans for cut in (first, last)})
+    stretches = []
+    for first, last in pairwise(cuts):
+        compared = [pair for a, b, pair in spans if a <= first and last <= b]
+        if compared:
+            stretches.append((first, last, compared))
+    return stretches
 
 
 def _stack(images: list[Array32]) -> Array32:
