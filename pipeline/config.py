@@ -5,7 +5,8 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -22,6 +23,8 @@ from pipeline.untrusted.plain_yaml import plain_yaml, read_plain_yaml
 DEFAULT_PRESET = "dentalsplat"
 #: Parts and letters of a setting's name; presets that extend each other; faults that are explained.
 _MOST_PARTS, _LONGEST_NAME, _LONGEST_CHAIN, _MOST_FAULTS = 8, 200, 20, 5
+#: pydantic's names of what a value may be, in the place of a fault
+_ALTERNATIVE = re.compile(r"(literal\[.*\]|constrained-\w+|function-.*|int|float|bool|str|none)$")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -208,7 +211,7 @@ def validate(model: type[Model], values: Any, section: str) -> Model:
     try:
         read = model.model_validate(values)
     except ValidationError as error:
-        faults = error.errors()
+        faults = _one_each(error.errors())
         said = [_explain(model, section, fault) for fault in faults[:_MOST_FAULTS]]
         more = len(faults) - len(said)
         said += [f"{more} more settings are wrong."] if more else []
@@ -251,12 +254,22 @@ def _unknown_section(
     )
 
 
+def _one_each(faults: Sequence[Any]) -> list[Any]:
+    """What is wrong with a value that may be one thing or another, said of both at once."""
+    found: dict[tuple[Any, ...], Any] = {}
+    for fault in faults:
+        place = tuple(part for part in fault["loc"] if not _ALTERNATIVE.match(str(part)))
+        first = found.setdefault(place, {**fault, "loc": place})
+        other = str(fault["msg"]).removeprefix("Input should be ")
+        if other not in first["msg"]:
+            first["msg"] = f"{first['msg']}, or {other}"
+    return list(found.values())
+
+
 def _explain(model: type[BaseModel], section: str, error: Any) -> str:
     """Say in one sentence which field is wrong, what is allowed, and what it is for."""
     location = [
-        str(part) if len(str(part)) <= _LONGEST_NAME else shown(part)
-        for part in error["loc"]
-        if not str(part).startswith("function-")
+        str(part) if len(str(part)) <= _LONGEST_NAME else shown(part) for part in error["loc"]
     ]
     dotted = ".".join(filter(None, [section, *location]))
     if error["type"] == "extra_forbidden":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -18,6 +19,7 @@ from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
 from stages.fit.parts.surface import Surface, Warp
 from stages.fit.settings import (
     AUTO,
+    PIXELS,
     AutoFloat,
     AutoInt,
     PartSettings,
@@ -51,7 +53,7 @@ class Basics(PartSettings):
     iterations: AutoInt = automatic({3: 400, 6: 500}, held=240, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
-    initial_points: AutoInt = automatic({3: 15000, 6: 30000}, held=30000, ge=4)
+    initial_points: AutoInt = automatic({3: 15000, 6: 30000}, held=30000, by_size=True, ge=4)
     """thin the input points to about this many"""
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """opacity that Gaussians start with (3DGS: 0.1)"""
@@ -147,7 +149,9 @@ class FitSettings(FitConfig):
         return self.model_copy(update=changes)
 
 
-def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) -> FitSettings:
+def resolve(
+    config: FitConfig, views: int, seed: int, held: bool | None = None, pixels: int = PIXELS
+) -> FitSettings:
     """Replace every ``"auto"`` by what it stands for.
 
     Args:
@@ -155,6 +159,7 @@ def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) 
         views: how many are placed.
         seed: of the run.
         held: what ``hold_surface: auto`` comes to; None: no.
+        pixels: of a view.
     """
     values = dict(config)
     if values["hold_surface"] == AUTO:
@@ -163,7 +168,8 @@ def resolve(config: FitConfig, views: int, seed: int, held: bool | None = None) 
         rule: Any = field.json_schema_extra
         if values[name] == AUTO and isinstance(rule, dict) and "views" in rule:
             flat = values["hold_surface"] and rule["held"] is not None
-            values[name] = rule["held"] if flat else by_rule(rule["views"], views)
+            value = rule["held"] if flat else by_rule(rule["views"], views)
+            values[name] = round(value * sqrt(pixels / PIXELS)) if rule["by_size"] else value
     if values["densify_until_iter"] == AUTO:
         values["densify_until_iter"] = max(0, values["iterations"] - SETTLE)
     return FitSettings.model_construct(**values, seed=seed)

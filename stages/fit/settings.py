@@ -16,6 +16,8 @@ from pydantic import (
 from pipeline.stage import StageConfig
 
 AUTO: Any = "auto"
+#: of a view, where a setting that grows with it says nothing of its size
+PIXELS = 512 * 384
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Weight = Annotated[float, Field(ge=0)]
@@ -39,7 +41,12 @@ else:
 
 
 def automatic(
-    views: Mapping[int, Any] | str, *, held: Any = None, ge: float | None = 0, **bounds: Any
+    views: Mapping[int, Any] | str,
+    *,
+    held: Any = None,
+    by_size: bool = False,
+    ge: float | None = 0,
+    **bounds: Any,
 ) -> Any:
     """A setting that is found where the user says nothing of it.
 
@@ -47,12 +54,16 @@ def automatic(
         views: what it comes to at so many views, in order; between them it follows the count. Or
             in words, where no table says it.
         held: what it comes to on a held surface, if that is something else.
+        by_size: that is for views of `PIXELS`; it grows with their width.
         ge, **bounds: of what the user may say.
     """
     if isinstance(views, str):
         extra: dict[str, Any] = {"auto": views}
     else:
-        extra = {"auto": _told(views, held), "views": dict(views), "held": held}
+        extra = {
+            "auto": _told(views, held) + (" (512 px; it grows with the width)" if by_size else ""),
+            "views": dict(views), "held": held, "by_size": by_size,
+        }  # fmt: skip
     return Field(AUTO, json_schema_extra=extra, ge=ge, **bounds)
 
 

@@ -72,7 +72,8 @@ class FitStage(Stage):
         held = worth_holding(
             placed_cameras, points.positions.astype(float), context.config.hold_min_angle
         )
-        settings = resolve(context.config, len(placed), context.seed, held)
+        pixels = max(view.image.shape[0] * view.image.shape[1] for view in placed)
+        settings = resolve(context.config, len(placed), context.seed, held, pixels)
 
         def report(iteration: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path, PurePath
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -21,10 +21,11 @@ FRAMES_OF_A_VIDEO = 24  # as the paper samples (section 4.1)
 class ViewsConfig(StageConfig):
     """How photographs are prepared."""
 
-    long_side: int = Field(
-        512, ge=64, le=4096,
-        description="working size: pixels of the long side; smaller photographs stay as they are",
-    )  # fmt: skip
+    long_side: Literal["auto"] | Annotated[int, Field(ge=64, le=4096)] = Field(
+        "auto",
+        description="working size: pixels of the long side; smaller photographs stay as they are "
+        "(auto: 1024, 724 or 512, as their sharpness and their number allow)",
+    )
     frames: int | None = Field(
         None, ge=2, le=1000,
         description="use this many, uniformly sampled; default: all photographs, 24 of a video",
@@ -50,7 +51,7 @@ class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
@@ -82,32 +83,41 @@ class ViewsStage(Stage):
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.views import HeldOut, Views
         from stages.views.load import (
+            Loaded,
             drop_duplicates,
             load_photos,
             load_video,
             prepared_views,
             shows_nothing,
         )
+        from stages.views.sharpness import SIZES, best_size
 
         config: ViewsConfig = context.config
         files = {k: v for k, v in context.sources.items() if not k.startswith(MASK_PREFIX)}
         masks = _masks_by_label(context.sources, files)
-        size = {"long_side": config.long_side, "min_side": config.min_side}
 
         def progress(done: int, total: int) -> None:
             context.progress("reading", done, total)
 
         first = next(iter(files))
         from_video = is_video(PurePath(first))
-        if from_video:
-            everything = load_video(
-                first, files[first], masks.get(first), config.frames or FRAMES_OF_A_VIDEO,
-                threads=context.threads, progress=progress, **size,
-            )  # fmt: skip
+
+        def load(long_side: int) -> list[Loaded]:
+            size = {"long_side": long_side, "min_side": config.min_side}
+            if from_video:
+                return load_video(
+                    first, files[first], masks.get(first), config.frames or FRAMES_OF_A_VIDEO,
+                    threads=context.threads, progress=progress, **size,
+                )  # fmt: skip
+            return load_photos(files, masks, threads=context.threads, progress=progress, **size)
+
+        if config.long_side == "auto":
+            everything = load(SIZES[0])
+            best = best_size([item.picture for item in everything])
+            if any(max(item.picture.rgb.shape) > best for item in everything):
+                everything = load(best)
         else:
-            everything = load_photos(
-                files, masks, threads=context.threads, progress=progress, **size
-            )
+            everything = load(config.long_side)
         held_names = held_labels([item.source_name for item in everything], config.held_out)
         loaded = [item for item in everything if item.source_name not in held_names]
         # the views come first: what is held out never decides which of them stays

@@ -60,7 +60,7 @@ def divide(packed: Floats, axes: Bools) -> tuple[Floats, Indices, Bools]:
     Returns:
         The new matrix, for each of its rows the old row that it came from, and whether it is new.
     """
-    source = np.arange(len(packed))
+    source = np.arange(len(packed), dtype=np.int64)
     offsets = np.zeros((len(packed), 3), np.float32)
     for axis in range(3):
         twice = axes[source, axis]
@@ -73,4 +73,4 @@ def divide(packed: Floats, axes: Bools) -> tuple[Floats, Indices, Bools]:
     moved = offsets * np.exp(result[:, 7:10])
     result[:, :3] += np.einsum("nij,nj->ni", rotations(result[:, 3:7]), moved)
     result[:, 7:10] += np.log(np.float32(SHRINK)) * axes[source]
-    return np.ascontiguousarray(result), source, axes[source].any(1)
+    return np.ascontiguousarray(result), source, np.asarray(axes[source].any(1))

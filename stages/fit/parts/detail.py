@@ -17,7 +17,7 @@ from stages.fit.arrays import Array, Floats
 from stages.fit.parts.base import Figures, Part
 from stages.fit.parts.start import reduction
 from stages.fit.parts.surface import Surface
-from stages.fit.settings import AutoInt, PartSettings, Positive, automatic
+from stages.fit.settings import AutoFloat, PartSettings, Positive, automatic
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
@@ -32,12 +32,15 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         detail: bool = True
         """split Gaussians where the photographs show more than they do, each time the images get
         larger"""
-        detail_gaussians: AutoInt = automatic({3: 60000}, ge=1)
-        """there are no more than so many after it; the largest errors come first"""
+        detail_density: Positive = 0.3
+        """there are at most so many Gaussians for each pixel of a photograph; the largest errors
+        come first"""
         detail_noise: Annotated[float, Field(ge=0)] = 1.5
         """an error counts above so many times the photograph's own noise"""
-        detail_error: Annotated[float, Field(ge=0, le=1)] = 0.008
-        """and above this (of 0..1): nobody sees less"""
+        # between few views that are close to each other, more Gaussians for what hardly shows cost
+        # unseen views .1 dB; on a held surface nothing
+        detail_error: AutoFloat = automatic({3: 0.03}, held=0.008, le=1)
+        """and above this (of 0..1)"""
         detail_size: Positive = 0.5
         """Gaussians are split along axes whose standard deviation is more pixels than this"""
 
@@ -52,7 +55,8 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
 
     def _split(self, fit: Trainer, factor: int) -> None:
         s: Any = self.settings
-        room = s.detail_gaussians - len(fit.packed)
+        pixels = max(target[1].width * target[1].height for target in fit.targets)
+        room = int(s.detail_density * pixels) - len(fit.packed)
         if room <= 0:
             return
         excess, area = unexplained(fit, factor, s.detail_noise, s.detail_error)

@@ -96,7 +96,8 @@ class Surface(
 
     def shrink(self, rows: Bools, factor: float) -> None:
         """Gaussians [N] are smaller from now on, in all that they may be."""
-        self.anchor[np.ix_(rows, (6, 8))] += np.float32(np.log(factor))
+        for column in (6, 8):
+            self.anchor[rows, column] += np.float32(np.log(factor))
 
     def select(self, source: Indices, fresh: Bools) -> None:
         self.anchor = np.ascontiguousarray(self.anchor[source])
