@@ -27,6 +27,8 @@ PHOTOGRAPHS = 4
 #: photographs of teeth and houses 43 have .7 to 2.7 at 1024 pixels; enlarged from half of that, 40
 #: of them have .35 to .7, and with a blur of 1.5 pixels all have .2 to .3.
 SHARP = 0.7
+#: power (of 0..255, squared) of an octave that holds nothing
+BLANK = 1e-3
 #: noise as by Immerkaer 1996, "Fast Noise Variance Estimation", by the median: edges are no noise
 LAPLACE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 MEDIAN_TO_SIGMA = 1 / (6 * 0.6745)
@@ -57,7 +59,7 @@ def sharpness(grey: Floats) -> float:
         max(float(np.square(band).mean()) - gain * variance, 0.0)
         for band, gain in zip(_octaves(grey), NOISE_GAINS, strict=True)
     )
-    return fine / coarse if coarse > 0 else 0.0
+    return fine / coarse if coarse > BLANK else 0.0
 
 
 def _octaves(image: Floats) -> tuple[Floats, Floats]:

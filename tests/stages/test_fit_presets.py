@@ -97,14 +97,14 @@ def test_every_setting_says_what_it_means_and_what_auto_is() -> None:
             assert "auto" in field.description, name
     text = FitConfig.model_fields["initial_points"].description
     assert text is not None and "15000 up to 3 views, 30000 from 6" in text
-    assert "60000 on a held surface" in text
+    assert "30000 on a held surface" in text
 
 
 def test_what_auto_comes_to_follows_the_number_of_views_without_steps() -> None:
     def at(views: int) -> FitSettings:
         return resolve(FitConfig(), views, 0)
 
-    assert [at(n).iterations for n in (2, 3, 4, 6, 9)] == [400, 400, 600, 1000, 1000]
+    assert [at(n).iterations for n in (2, 3, 4, 6, 9)] == [400, 400, 433, 500, 500]
     assert [at(n).max_gaussians for n in (3, 5, 6, 12)] == [15000, 45000, 60000, 60000]
     rates = [at(n).feature_rest_lr for n in range(3, 11)]
     assert rates == sorted(rates) and rates[3] == 7.5e-4 and rates[-2:] == [2e-3, 2e-3]

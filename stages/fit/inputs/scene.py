@@ -94,9 +94,9 @@ class Scene:
         """With images that are already small."""
         return replace(self, targets=[{1: target[factor]} for target in self.targets])
 
-    def without(self, view: int) -> Scene:
-        """All views but one."""
-        rest = [index for index in range(len(self.views)) if index != view]
+    def without(self, some: Sequence[int]) -> Scene:
+        """All views but some."""
+        rest = [index for index in range(len(self.views)) if index not in some]
         return replace(
             self,
             views=tuple(self.views[index] for index in rest),

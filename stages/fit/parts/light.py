@@ -50,7 +50,7 @@ class Light(
     class Settings(PartSettings):
         light: Literal["auto", "camera", "none"] = "auto"
         """a light beside the lens: albedo, normals, falloff and highlights in place of spherical
-        harmonics (auto: where a short trial predicts a held-out photograph better with it; on a
+        harmonics (auto: where a trial predicts held-out photographs better with it; on a
         held surface where it explains how colours change between photographs)"""
         light_diffuse: Annotated[float, Field(gt=0, lt=0.98)] = 0.9
         """share k of light that comes from the lens: 1 - k + k n.v, to start with"""
@@ -77,14 +77,14 @@ class Light(
         normals until any strength fits"""
         light_lr_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
         """what the light's, albedos' and normals' rates have fallen to at the end"""
-        light_trial_iterations: Count = 100
+        light_trial_iterations: Count = 300
         """steps of each trial of light: auto"""
-        light_trial_points: Annotated[int, Field(ge=100)] = 6000
+        light_trial_points: Annotated[int, Field(ge=100)] = 8000
         """Gaussians of each trial of light: auto"""
         light_trial_factor: Annotated[int, Field(ge=1, le=16)] = 4
         """by which factor its images are reduced"""
-        light_margin: Weight = 0.1
-        """dB by which the trial with a light has to be better on the held-out photograph"""
+        light_margin: Weight = 0.3
+        """dB by which the trial with a light has to be better on the held-out photographs"""
         light_evidence: Share = 0.7
         """on a held surface there is a light if its shading lowers the error of predicting the
         photographs from one another to this share"""

@@ -1,0 +1,92 @@
+"""Gaussians that are split for detail, and the sizes at which they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.fit.config import FitConfig, resolve
+from stages.fit.numerics.detail import APART, SHRINK, divide, noise_level, wide_axes, within
+from stages.fit.parts.start import coarse_factors, reduction
+
+
+def packed(count: int) -> np.ndarray:
+    result = np.zeros((count, 14), np.float32)
+    result[:, 3] = 1
+    result[:, 0] = np.arange(count)
+    result[:, 7:10] = np.log([0.4, 0.2, 0.05])
+    result[:, 11] = np.arange(count)
+    return result
+
+
+def test_images_grow_by_halves_and_end_at_full_size() -> None:
+    settings = resolve(
+        FitConfig(iterations=100, coarse_fraction=0.6, coarse_factor=4), 3, 0, None
+    )
+    assert coarse_factors(settings) == [4, 2]
+    factors = [reduction(settings, k) for k in range(1, 101)]
+    assert factors == [4] * 30 + [2] * 30 + [1] * 40
+
+
+@pytest.mark.parametrize("changes", [{"coarse_fraction": 0.0}, {"coarse_factor": 1}])
+def test_no_small_images_where_none_are_wanted(changes: dict) -> None:
+    settings = resolve(FitConfig(**changes), 3, 0, None)
+    assert not coarse_factors(settings)
+    assert reduction(settings, 1) == 1
+
+
+def test_a_gaussian_is_split_along_the_axes_asked_for() -> None:
+    axes = np.zeros((3, 3), bool)
+    axes[1, 0] = True
+    axes[2, :2] = True
+    result, source, fresh = divide(packed(3), axes)
+    assert sorted(source) == [0, 1, 1, 2, 2, 2, 2]
+    assert not fresh[source == 0].any() and fresh[source > 0].all()
+    one, four = result[source == 1], result[source == 2]
+    np.testing.assert_allclose(sorted(one[:, 0]), [1 - 0.4 * APART, 1 + 0.4 * APART], atol=1e-6)
+    np.testing.assert_allclose(np.exp(one[:, 7]), 0.4 * SHRINK, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(one[:, 8]), 0.2, rtol=1e-5)
+    np.testing.assert_allclose(four[:, :3].mean(0), [2, 0, 0], atol=1e-6)
+    assert len(np.unique(four[:, :2].round(5), axis=0)) == 4
+    assert (result[:, 11] == source).all()
+
+
+def test_a_turned_gaussian_is_split_along_its_own_axis() -> None:
+    one = packed(1)
+    one[0, 3:7] = np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)  # x is y now
+    result, _, _ = divide(one, np.array([[True, False, False]]))
+    np.testing.assert_allclose(np.ptp(result[:, 1]), 2 * 0.4 * APART, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(result[:, 0]), 0, atol=1e-6)
+
+
+def test_only_what_is_wide_on_the_screen_is_split_and_never_the_thinnest_axis() -> None:
+    wide = wide_axes(packed(2), np.array([0.01, 0.5], np.float32), 0.5)
+    assert wide.tolist() == [[True, True, False], [True, False, False]]
+
+
+def test_the_largest_errors_come_first() -> None:
+    axes = np.ones((4, 3), bool)
+    axes[:, 2] = False
+    chosen = within(axes, np.array([1.0, 4.0, 3.0, 2.0]), 7)
+    assert chosen.any(1).tolist() == [False, True, True, False]
+
+
+def test_noise_is_told_from_texture() -> None:
+    rng = np.random.default_rng(5)
+    v, u = np.mgrid[:120, :160].astype(np.float32)
+    smooth = np.stack([0.5 + 0.2 * np.sin(u / 17 + v / 23)] * 3)
+    smooth[:, 40:60, 40:90] = 0.9  # an edge is no noise
+    noisy = smooth + rng.normal(0, 0.02, smooth.shape[1:]).astype(np.float32)
+    everywhere = np.ones(smooth.shape[1:], np.float32)
+    assert noise_level(smooth, everywhere) < 0.001
+    assert noise_level(noisy, everywhere) == pytest.approx(0.02, rel=0.1)
+    assert noise_level(noisy, 0 * everywhere) == 0
+
+
+def test_a_start_from_more_points_for_larger_pictures() -> None:
+    small, large = (
+        resolve(FitConfig(), 3, 0, True, pixels).initial_points
+        for pixels in (512 * 384, 1024 * 768)
+    )
+    assert large == 2 * small
+    assert resolve(FitConfig(initial_points=77), 3, 0, True, 10**6).initial_points == 77

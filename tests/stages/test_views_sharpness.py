@@ -1,0 +1,59 @@
+"""As many pixels as the photographs are sharp for."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.views.sharpness import SHARP, SIZES, best_size, sharpness
+from stages.views.working import Prepared
+
+
+def scene(seed: int, width: int = 1024, height: int = 768) -> np.ndarray:
+    """[H, W] float32 0..255 with the spectrum of natural images."""
+    random = np.random.default_rng(seed)
+    fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None]
+    falloff = 1 / np.maximum(np.hypot(fx, fy), 1 / width)
+    spectrum = falloff * np.exp(2j * np.pi * random.random(falloff.shape))
+    image = np.fft.irfft2(spectrum, (height, width))
+    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.float32)
+
+
+def picture(grey: np.ndarray) -> Prepared:
+    rgb = np.repeat(np.rint(np.clip(grey, 0, 255)).astype(np.uint8)[..., None], 3, 2)
+    return Prepared(rgb, None, np.eye(3), grey.shape[::-1], None)
+
+
+def enlarged(grey: np.ndarray, factor: float) -> np.ndarray:
+    size = grey.shape[::-1]
+    small = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC))
+
+
+def test_sharp_photographs_are_used_at_full_size() -> None:
+    assert best_size([picture(scene(k)) for k in range(3)]) == SIZES[0]
+
+
+def test_blurred_and_enlarged_ones_are_not() -> None:
+    blurred = [picture(cv2.GaussianBlur(scene(k), (0, 0), 3)) for k in range(3)]
+    assert best_size(blurred) == SIZES[-1]
+    assert best_size([picture(enlarged(scene(k), 4)) for k in range(3)]) == SIZES[-1]
+    assert best_size([picture(enlarged(scene(k), 2)) for k in range(3)]) < SIZES[0]
+
+
+def test_noise_is_no_sharpness() -> None:
+    rng = np.random.default_rng(5)
+    blurred = cv2.GaussianBlur(scene(1), (0, 0), 2.5)
+    noisy = blurred + rng.normal(0, 3, blurred.shape).astype(np.float32)
+    assert sharpness(noisy) < SHARP
+
+
+def test_more_photographs_are_smaller() -> None:
+    one = picture(scene(1))
+    assert [best_size([one] * n) for n in (3, 4, 6, 12, 24)] == [1024, 1024, 724, 512, 512]
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_blank_picture_has_no_detail(level: int) -> None:
+    assert sharpness(np.full((90, 120), level, np.float32)) == 0
