@@ -42,7 +42,8 @@ def into_world(gaussians: Gaussians, frame_from_world: npt.NDArray[np.float64]) 
     quats = gaussians.quats_wxyz.astype(np.float64)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     unit = replace(gaussians, quats_wxyz=quats.astype(np.float32))
-    return move_gaussians(unit, np.linalg.inv(frame_from_world))
+    world_from_frame = np.asarray(np.linalg.inv(frame_from_world), np.float64)
+    return move_gaussians(unit, world_from_frame)
 
 
 def share_in_view(gaussians: Gaussians, cameras: Sequence[Camera]) -> float:
