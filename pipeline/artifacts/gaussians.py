@@ -8,7 +8,6 @@ colour behind them, where it is known and not black, is in `background.json`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,6 +16,7 @@ import numpy.typing as npt
 from plyfile import PlyData, PlyElement
 
 from pipeline.artifacts.base import Artifact
+from pipeline.errors import RequestError
 from pipeline.files import read_json, write_json
 from pipeline.untrusted.scenes.ply import read_cloud
 
@@ -24,6 +24,10 @@ Array = npt.NDArray[np.float32]
 
 #: 3DGS stores spherical harmonics up to degree 3: a constant and 15 more coefficients a colour.
 SH_COEFFICIENTS = 16
+#: More Gaussians than any scene has; their harmonics alone take 2 GB.
+MOST_GAUSSIANS = 10_000_000
+#: Numbers `f_rest_*` of a Gaussian for degrees 0 to 3.
+REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(4))
 
 
 @dataclass(frozen=True)
@@ -130,27 +134,40 @@ def read_gaussians_ply(path: Path) -> dict[str, Array]:
     """Read a 3DGS `.ply` of any spherical-harmonics degree 0..3 into the fields of `Gaussians`.
 
     Raises:
-        RequestError: it is damaged, or lacks a property of these.
+        RequestError: it is damaged, lacks a property of these, has harmonics of no such degree, or
+            more Gaussians than any scene.
     """
     always = [n for n in ply_properties() if n[0] != "n" and not n.startswith("f_rest_")]
     vertex = read_cloud(path, always)
     count = len(vertex["x"])
+    if count > MOST_GAUSSIANS:
+        raise RequestError(
+            f"{path} has {count:,} Gaussians, more than the {MOST_GAUSSIANS:,} that are read. "
+            "Prune it."
+        )
+    number = sum(name.startswith("f_rest_") for name in vertex)
+    rest_names = [f"f_rest_{k}" for k in range(number)]
+    if number not in REST_COUNTS or not vertex.keys() >= set(rest_names):
+        raise RequestError(
+            f"{path} has {number} properties f_rest_*, which are spherical harmonics of no degree "
+            f"that is known: degrees 0 to 3 have {', '.join(map(str, REST_COUNTS[:-1]))} and "
+            f"{REST_COUNTS[-1]}, numbered from 0. Write it with one of these."
+        )
 
-    def stack(prefix: str, number: int) -> Array:
-        return np.stack([vertex[f"{prefix}{k}"] for k in range(number)], -1).astype(np.float32)
+    def stack(names: list[str]) -> Array:
+        with np.errstate(over="ignore"):  # doubles beyond float32 become infinite
+            return np.stack([vertex[name] for name in names], -1).astype(np.float32)
 
     sh = np.zeros((count, SH_COEFFICIENTS, 3), np.float32)
-    sh[:, 0] = stack("f_dc_", 3)
-    rest_names = takewhile(vertex.__contains__, (f"f_rest_{k}" for k in range(45)))
-    per_channel = len(list(rest_names)) // 3
-    if per_channel:
-        rest = stack("f_rest_", 3 * per_channel).reshape(count, 3, per_channel)
-        sh[:, 1 : 1 + per_channel] = rest.transpose(0, 2, 1)
+    sh[:, 0] = stack([f"f_dc_{k}" for k in range(3)])
+    if number:
+        rest = stack(rest_names).reshape(count, 3, number // 3)
+        sh[:, 1 : 1 + number // 3] = rest.transpose(0, 2, 1)
     return {
-        "means": np.stack([vertex[n] for n in "xyz"], -1).astype(np.float32),
-        "quats_wxyz": stack("rot_", 4),
-        "log_scales": stack("scale_", 3),
-        "logit_opacities": np.array(vertex["opacity"], np.float32),
+        "means": stack(["x", "y", "z"]),
+        "quats_wxyz": stack([f"rot_{k}" for k in range(4)]),
+        "log_scales": stack([f"scale_{k}" for k in range(3)]),
+        "logit_opacities": stack(["opacity"])[:, 0],
         "sh": sh,
     }
 

@@ -12,10 +12,10 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views, to_uint8
-from stages.export.frame import move_cameras, move_gaussians, move_points
 from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, there_and_back
 from stages.export.pictures.video import even
 from stages.export.splats import opacities
+from stages.splatting.frame import move_cameras, move_gaussians, move_points
 from stages.splatting.rendering import RenderedView, render
 
 Progress = Callable[..., None]

@@ -182,7 +182,7 @@ PATHS = ["~nosuchuser/x", "a" * 300, "b/" * 3000, "nul\0byte", f"{__file__}/belo
 def test_paths_that_no_file_system_has_are_refused(path: str, tmp_path: Path) -> None:
     settings = (
         "views.masks", "init.cameras", "init.pointmap.files", "init.pointmap.checkpoint",
-        "init.pointmap.package_folder", "init.dental.labels", "swap.cameras",
+        "init.pointmap.package_folder", "init.dental.labels", "swap.cameras", "splats.file",
         "evaluate.ground_truth", "evaluate.mesh", "evaluate.masks", "evaluate.lpips_weights",
     )  # fmt: skip
     for setting in settings:

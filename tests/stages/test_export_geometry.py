@@ -5,20 +5,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from stages.export.frame import (
-    harmonics,
-    harmonics_rotation,
-    move_cameras,
-    move_gaussians,
-    move_points,
-    split_similarity,
-)
 from stages.export.pictures.orbits import (
     between,
     central_depth,
     find_orbit,
     look_at,
     there_and_back,
+)
+from stages.splatting.frame import (
+    harmonics,
+    harmonics_rotation,
+    move_cameras,
+    move_gaussians,
+    move_points,
+    split_similarity,
 )
 from stages.splatting.rendering import render
 from tests.stages import export_scene as scene

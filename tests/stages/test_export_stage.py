@@ -16,8 +16,8 @@ from pipeline.artifacts.gaussians import read_gaussians_ply
 from pipeline.artifacts.views import View, Views, read_png, to_uint8
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
-from stages.export.frame import move_cameras
 from stages.export.stage import ExportConfig, ExportStage
+from stages.splatting.frame import move_cameras
 from tests.stages import export_scene as scene
 
 #: our world -> the input's millimetres

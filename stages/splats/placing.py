@@ -1,0 +1,56 @@
+"""Gaussians of another program: whether they can be rendered, and where they lie."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.gaussians import Gaussians
+from stages.splatting.frame import move_gaussians
+
+#: Natural logarithm of a standard deviation above which its square is not far from overflowing.
+LARGEST_LOG_SCALE = 40.0
+
+
+def unusable(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
+    """[N] True where a number is not finite, a rotation is none, or a size is beyond measure."""
+    count = len(gaussians)
+    numbers = (
+        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales,
+        gaussians.logit_opacities[:, None], gaussians.sh.reshape(count, -1),
+    )  # fmt: skip
+    finite = np.all([np.isfinite(part).all(1) for part in numbers], axis=0)
+    turned = np.linalg.norm(gaussians.quats_wxyz.astype(np.float64), axis=1) > 1e-12
+    return ~(finite & turned & (gaussians.log_scales < LARGEST_LOG_SCALE).all(1))
+
+
+def into_world(gaussians: Gaussians, frame_from_world: npt.NDArray[np.float64]) -> Gaussians:
+    """Gaussians that were given in a frame, in our world, with rotations of length 1.
+
+    Args:
+        gaussians: N usable ones (`unusable`); their rotations may have any length, as 3DGS writes
+            them.
+        frame_from_world: [4, 4] similarity from our world to that frame.
+
+    Raises:
+        ValueError: it is no similarity.
+    """
+    quats = gaussians.quats_wxyz.astype(np.float64)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = replace(gaussians, quats_wxyz=quats.astype(np.float32))
+    world_from_frame = np.asarray(np.linalg.inv(frame_from_world), np.float64)
+    return move_gaussians(unit, world_from_frame)
+
+
+def share_in_view(gaussians: Gaussians, cameras: Sequence[Camera]) -> float:
+    """Share of the Gaussians whose centres lie in the picture of at least one camera, 0..1."""
+    seen = np.zeros(len(gaussians), bool)
+    for camera in cameras:
+        pixels, depth = camera.project(gaussians.means)
+        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        seen |= inside & (depth > 0)
+    return float(seen.mean())
