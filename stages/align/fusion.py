@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
-from pipeline.geometry.neighbours import nearest_views
 from pipeline.geometry.normals import depth_normals
+from pipeline.geometry.order import nearest_views
 from pipeline.kernels import each, kernel, kernel_threads
 
 Array = npt.NDArray[np.float32]

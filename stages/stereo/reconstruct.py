@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.geometry.neighbours import nearest_views
+from pipeline.geometry.order import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray

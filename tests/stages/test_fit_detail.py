@@ -20,9 +20,7 @@ def packed(count: int) -> np.ndarray:
 
 
 def test_images_grow_by_halves_and_end_at_full_size() -> None:
-    settings = resolve(
-        FitConfig(iterations=100, coarse_fraction=0.6, coarse_factor=4), 3, 0, None
-    )
+    settings = resolve(FitConfig(iterations=100, coarse_fraction=0.6, coarse_factor=4), 3, 0, None)
     assert coarse_factors(settings) == [4, 2]
     factors = [reduction(settings, k) for k in range(1, 101)]
     assert factors == [4] * 30 + [2] * 30 + [1] * 40

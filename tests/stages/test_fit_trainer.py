@@ -147,7 +147,9 @@ def test_too_little_to_start_from_is_explained(tmp_path) -> None:
 
 def test_divergence_stops_with_a_diagnosis_and_keeps_the_checkpoint(tmp_path) -> None:
     views, cameras, points = case()
-    broken = context(tmp_path, views, cameras, points, feature_lr=1e38, checkpoint_every=1)
+    broken = context(
+        tmp_path, views, cameras, points, feature_lr=1e38, light="none", checkpoint_every=1
+    )
     with pytest.raises(ReconstructionError, match="diverged at iteration"):
         FitStage().run(broken)
     assert (broken.scratch / "fit.npz").exists()
