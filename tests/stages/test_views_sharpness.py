@@ -14,7 +14,7 @@ def scene(seed: int, width: int = 1024, height: int = 768) -> np.ndarray:
     """[H, W] float32 0..255 with the spectrum of natural images."""
     random = np.random.default_rng(seed)
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None]
-    falloff = 1 / np.maximum(np.hypot(fx, fy), 1 / width) ** 1.3  
+    falloff = 1 / np.maximum(np.hypot(fx, fy), 1 / width) ** 1.3
     spectrum = falloff * np.exp(2j * np.pi * random.random(falloff.shape))
     image = np.fft.irfft2(spectrum, (height, width))
     return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.float32)
