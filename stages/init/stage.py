@@ -28,7 +28,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 9
+    version = 10
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
