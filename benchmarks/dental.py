@@ -1,6 +1,6 @@
 """The dental path against the truth: labels, cameras, surface, seconds.
 
-    python benchmarks/dental.py --data DIR [--only 001,012,022] [--threads 2]
+    python benchmarks/dental.py --data DIR [--only 001,012,022] [--long-side 512] [--threads 2]
 
 DIR holds `scan_video_a/` (exact cameras, `teeth.ply`) and, where there is one, `dental_photos_a/`
 (cameras of reference only). Nothing here is known to the method: no focal length, no order.
@@ -26,6 +26,7 @@ from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.rigid import angle_between, nearest_rotation
 from pipeline.geometry.similarity import similarity
+from stages.dentition.working import resized_dentition, working_view
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.solution import PlacedView
@@ -40,6 +41,7 @@ TRIPLES = (
     "005,012,023", "000,011,018", "001,009,020", "003,014,022",
 )  # fmt: skip
 PHOTOS = "0_right,1_frontal,2_left"
+#: Of the video's frames, and the photographs' unless --long-side says otherwise.
 SIZE = (512, 384)
 #: Share of the pairs that an alignment is made of; the rest are outliers.
 KEPT = 85
@@ -102,8 +104,9 @@ class Case:
     cameras: list[Camera]
 
 
-def read_case(data: Path, names: str) -> Case:
-    """Photographs at working size."""
+def read_case(data: Path, names: str, long_side: int = SIZE[0]) -> Case:
+    """Photographs of this long side; frames as they are."""
+    size = (long_side, long_side * 3 // 4) if names == PHOTOS else SIZE
     cameras, views = [], []
     if names == PHOTOS:
         frames = json.loads((data / "dental_photos_a/transforms_reference.json").read_text())
@@ -112,30 +115,34 @@ def read_case(data: Path, names: str) -> Case:
     for number, name in enumerate(names.split(",")):
         if names == PHOTOS:
             frame = frames["frames"][name]
-            matrix = np.array(frame["K"]) / 2
+            matrix = np.array(frame["K"]) * long_side / 1024
             image = cv2.imread(str(data / f"dental_photos_a/images/{name}.jpg"))
         else:
             frame = next(f for f in frames["frames"] if Path(f["file_path"]).stem == name)
             focal = frames["fl_x"]
             matrix = np.array([[focal, 0, frames["cx"]], [0, focal, frames["cy"]], [0, 0, 1]])
             image = cv2.imread(str(data / "scan_video_a" / frame["file_path"]))
-        if image.shape[1::-1] != SIZE:
-            image = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+        if image.shape[1::-1] != size:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         pose = np.array(frame["w2c_opencv"])
         pose = pose if len(pose) == 4 else np.vstack([pose, [0, 0, 0, 1]])
         views.append(View(f"{number:03d}", image[..., ::-1].astype(np.float32) / 255))
         cameras.append(
-            Camera(name, *SIZE, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
+            Camera(name, *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
         )
     return Case(names, views, cameras)
 
 
 def read_teeth(case: Case, threads: int) -> list[Dentition | None]:
     """The crowns of each photograph as the stage `teeth` reads them; None: it is set aside."""
-    readings = read_photographs(case.views, threads, lambda *_: None)
-    images = [view.image for view in case.views]
+    working = [working_view(view) for view in case.views]
+    readings = read_photographs(working, threads, lambda *_: None)
+    images = [view.image for view in working]
     chosen = choose(readings, images, case.name.split(","), ChoiceOptions())
-    return [None if d.set_aside or not d.all_crowns else d for d in chosen]
+    return [
+        None if d.set_aside or not d.all_crowns else resized_dentition(d, (v.width, v.height))
+        for d, v in zip(chosen, case.views, strict=True)
+    ]
 
 
 def count_labels(case: Case, scan: Scan, teeth: Reconstruction) -> tuple[int, int, int]:
@@ -200,7 +207,7 @@ def epipolar_errors(case: Case, teeth: Reconstruction) -> tuple[float, float]:
     for i in range(len(seen) - 1):
         shared = sorted(set(seen[i]) & set(seen[i + 1]))
         ends = [np.array([seen[k][name] for name in shared]).reshape(-1, 2) for k in (i, i + 1)]
-        ours = [_camera(placed) for placed in teeth.fit.views[i : i + 2]]
+        ours = [_camera(teeth, k) for k in (i, i + 1)]
         found.append(_sampson(*ours, *ends))
         truth.append(_sampson(*case.cameras[i : i + 2], *ends))
     return float(np.median(np.concatenate(found))), float(np.median(np.concatenate(truth)))
@@ -218,9 +225,12 @@ def _landmarks(dentition: Dentition, placed: PlacedView) -> dict[tuple[str, int]
     return found
 
 
-def _camera(placed: PlacedView) -> Camera:
-    centre = (SIZE[0] / 2, SIZE[1] / 2)
-    return Camera("", *SIZE, placed.focal, placed.focal, *centre, placed.cam_from_world)
+def _camera(teeth: Reconstruction, number: int) -> Camera:
+    placed, view = teeth.fit.views[number], teeth.views[number]
+    assert placed is not None
+    size = (view.width, view.height)
+    centre = (size[0] / 2, size[1] / 2)
+    return Camera("", *size, placed.focal, placed.focal, *centre, placed.cam_from_world)
 
 
 def _sampson(first: Camera, second: Camera, one: Array, other: Array) -> Array:
@@ -240,12 +250,12 @@ def surface_scores(
     """Median and 90 % of the distance of tooth depths to the scan after similarity and ICP, mm;
     share within 1 mm; share of the tooth pixels that have depth."""
     found, truth, covered, shown = [], [], 0, 0
-    for camera, view, dentition, placed in zip(
-        case.cameras, teeth.surface.views, teeth.dentitions, teeth.fit.views, strict=True
+    for number, (camera, view, dentition) in enumerate(
+        zip(case.cameras, teeth.surface.views, teeth.dentitions, strict=True)
     ):
-        if view is None or dentition is None or placed is None:
+        if view is None or dentition is None or teeth.fit.views[number] is None:
             continue
-        ours = _camera(placed)
+        ours = _camera(teeth, number)
         ids, points = scan.look(camera)
         tooth = _tooth_pixels(case, ids, dentition)
         covered += int((tooth & (view.depth > 0)).sum())
@@ -290,6 +300,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="folder with scan_video_a, dental_photos_a")
     parser.add_argument("--only", default="", help="one set, as 001,012,022 or 'photos'")
+    parser.add_argument("--long-side", type=int, default=SIZE[0], help="of the photographs, pixels")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--pictures", type=Path, help="where to write the pictures")
     options = parser.parse_args()
@@ -307,7 +318,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for names in sets:
-        case = read_case(options.data, names)
+        case = read_case(options.data, names, options.long_side)
         cpu, wall = time.process_time(), time.perf_counter()
         try:
             teeth = reconstruct_teeth(

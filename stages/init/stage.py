@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from stages.pointmaps.options import PointmapOptions
 
 
+#: Degrees by which rows of teeth may be turned for photographs to count as upright: half of what
+#: features do not stand (`roll.SMALLEST_ROLL`), for two may be turned against each other.
+UPRIGHT = 6.0
 #: How few and how many photographs the dental path takes on its own accord.
 DENTAL_VIEWS = (3, 12)
 
@@ -28,7 +32,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 9
+    version = 10
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -179,11 +183,14 @@ def _from_features(context: StageContext, views: Views) -> None:
     from stages.init.write import densify
 
     config: InitConfig = context.config
+    refinement = RefinementOptions(**config.refinement.model_dump())
+    if refinement.unroll and _stand_upright(context, views):
+        refinement = replace(refinement, unroll=False)
     try:
         placement = place_classical(
             list(views.views), with_focals(views.views, config.focal), config.focal is not None,
             views.ordered, least_views(len(views), config.min_views_fraction),
-            _classical_options(config), RefinementOptions(**config.refinement.model_dump()),
+            _classical_options(config), refinement,
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=context.warn,
             pictures=config.match_pictures,
@@ -196,6 +203,15 @@ def _from_features(context: StageContext, views: Views) -> None:
         _from_teeth_instead(context, views, unplaced)
     else:
         densify(context, views, placement.normalised())
+
+
+def _stand_upright(context: StageContext, views: Views) -> bool:
+    """Do the rows of teeth say that no photograph is rolled against the others?"""
+    if not context.has("teeth"):
+        return False
+    read = {dentition.name: dentition for dentition in context.load("teeth").chosen}
+    rolls = [abs(math.degrees(read[v.name].roll)) for v in views.views if v.name in read]
+    return len(rolls) == len(views) and max(rolls) < UPRIGHT
 
 
 def _teeth_are_worth_a_try(context: StageContext, views: Views) -> bool:

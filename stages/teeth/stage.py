@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 4
+    version = 5
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)
@@ -35,12 +35,14 @@ class TeethStage(Stage):
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.teeth import Dentition, Teeth
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
+        from stages.dentition.working import resized_dentition, working_view
         from stages.teeth.choose import ChoiceOptions, choose
         from stages.teeth.reader import PhotographReader
 
         config: TeethConfig = context.config
         views = context.load("views").views
-        reader = PhotographReader(views, context.threads)
+        working = [working_view(view) for view in views]
+        reader = PhotographReader(working, context.threads)
         wanted = config.method != "none" and (
             config.method == "reader" or (len(views) <= config.most_views and reader.shows_teeth())
         )
@@ -56,12 +58,16 @@ class TeethStage(Stage):
             config.least_score,
         )  # fmt: skip
         names = [view.source_name or view.name for view in views]
-        images = [view.image for view in views]
-        dentitions = (
+        images = [view.image for view in working]
+        found = (
             choose(readings, images, names, options)
             if config.set_aside
             else [reading.dentition for reading in readings]
         )
+        dentitions = [
+            resized_dentition(dentition, (view.width, view.height))
+            for dentition, view in zip(found, views, strict=True)
+        ]
         pictures = {
             view.name: labelled_overlay(view.image, dentition)
             for view, dentition in zip(views, dentitions, strict=True)

@@ -12,6 +12,7 @@ from stages.init.sfm.matching.features import (
     detect_features,
     joined,
     merge_points,
+    reduced,
     squeezed,
 )
 from stages.init.sfm.matching.match import (
@@ -195,3 +196,17 @@ def test_views_with_less_than_two_links_or_outside_the_largest_group_are_weak():
     assert weakly_linked([*ring, (4, 5)], 6) == {4, 5}
     assert weakly_linked([(0, 1)], 2) == set()
     assert weakly_linked([], 2) == {0, 1}
+
+
+def test_features_of_a_reduced_image_are_enlarged_to_its_own_pixels():
+    small, inside = reduced(np.zeros((768, 1024), np.uint8), np.ones((768, 1024), bool), 640)
+    assert small.shape == inside.shape == (480, 640)
+    assert inside.all()
+    features = make_features([[320.0, 240.0]], random_descriptors(1, 0)).enlarged((1.6, 1.6))
+    np.testing.assert_allclose(features.positions, [[512.0, 384.0]])
+    np.testing.assert_allclose(features.scales, [1.6])
+
+
+def test_a_small_image_is_not_reduced():
+    gray, valid = np.zeros((384, 512), np.uint8), np.ones((384, 512), bool)
+    assert reduced(gray, valid, 640)[0] is gray

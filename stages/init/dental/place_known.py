@@ -19,6 +19,7 @@ from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.geometry.world import similarity_between
 from pipeline.stage import StageContext
 from stages.dentition.crowns import dentition_of, outline_of
+from stages.dentition.working import working_scale
 from stages.init.config import CAMERAS, InitConfig
 from stages.init.dental.cameras.centred import CentredView, centre_view
 from stages.init.dental.place import (
@@ -123,6 +124,7 @@ def from_known_teeth(
         [found.view for found in centred], names, chosen, [found.focal for found in centred],
         arch, surface, accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
         progress=context.progress, cameras=[camera.cam_from_world for camera in cameras],
+        scales=[working_scale(view.width, view.height) for view in placed],
     )  # fmt: skip
     without = [name for name, view in zip(names, teeth.fit.views, strict=True) if view is None]
     if without:

@@ -12,13 +12,16 @@ from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from stages.dentition.crowns import mirrored_dentition
 from stages.dentition.overlay import labelled_overlay, sheet
+from stages.dentition.working import resized_dentition, working_scale, working_view
 from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photo import FullSize
 from stages.init.dental.turned_sheet import turned_sheet
 
 Array = npt.NDArray[np.float64]
@@ -41,7 +44,7 @@ class Reconstruction:
     Attributes:
         views: the photographs, mirror images among them turned back.
         dentitions: the teeth in each with their numbers; None where none are used.
-        fit: cameras and named landmarks.
+        fit: cameras and named landmarks, in pixels of `views`.
         surface: dense depth of each placed view, and one cloud.
         mirrored: which photographs were turned back.
         pictures: for people to check: the labelled photographs, the cloud turned.
@@ -59,8 +62,12 @@ def reconstruct_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
     accept_doubtful: bool, threads: int, progress: Progress, cameras: list[Array] | None = None,
+    scales: list[float] | None = None,
 ) -> Reconstruction:  # fmt: skip
     """Say which tooth is which, place the cameras, and make the surface.
+
+    All of this sees the photographs at one size, so that theirs decides nothing; depths and colours
+    are those of the photographs as they are.
 
     Args:
         views: photographs of one patient's teeth, in any order.
@@ -69,6 +76,7 @@ def reconstruct_teeth(
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
         cameras: [4, 4] cam_from_world of each where the cameras are known (`fit_arch`).
+        scales: by how much each is reduced; None: `working_scale`.
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
@@ -83,15 +91,24 @@ def reconstruct_teeth(
             {"teeth": Teeth(tuple(d for d in dentitions if d is not None))} if found else {},
         )
 
+    scales = scales or [working_scale(view.width, view.height) for view in views]
+    small = [working_view(view, scale) for view, scale in zip(views, scales, strict=True)]
+    read = [_resized(d, view) for d, view in zip(dentitions, small, strict=True)]
+    shrunk = [focal and focal * s for focal, s in zip(focals, scales, strict=True)]
+
     def placed_by(views: list[View], dentitions: list[Dentition | None]) -> ArchFit:
         images, valid = [view.image for view in views], [view.valid() for view in views]
-        return fit_arch(dentitions, images, valid, focals, arch, threads, progress, names, cameras)
+        return fit_arch(dentitions, images, valid, shrunk, arch, threads, progress, names, cameras)
 
     if cameras is None:
-        turned = fit_turned(views, dentitions, names, placed_by)
+        turned = fit_turned(small, read, names, placed_by)
     else:
-        turned = Turned(views, dentitions, placed_by(views, dentitions))
-    views, dentitions, fit = turned.views, turned.dentitions, turned.fit
+        turned = Turned(small, read, placed_by(small, read))
+    views = [v.mirrored() if k in turned.mirrored else v for k, v in enumerate(views)]
+    dentitions = [
+        mirrored_dentition(d) if d and k in turned.mirrored else d for k, d in enumerate(dentitions)
+    ]
+    fit = turned.fit.enlarged([1 / scale for scale in scales])
     numbered = [
         None if dentition is None else with_numbers(dentition, placed, fit)
         for dentition, placed in zip(dentitions, fit.views, strict=True)
@@ -107,12 +124,21 @@ def reconstruct_teeth(
             pictures,
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
+    full = [
+        FullSize(view.image, view.valid(), d.mask, d.above) if d else None
+        for view, d in zip(views, numbered, strict=True)
+    ]
     dense = dense_surface(
-        [view.image for view in views], [view.valid() for view in views], numbered, fit, surface,
-        threads, progress,
+        [view.image for view in turned.views], [view.valid() for view in turned.views],
+        turned.dentitions, turned.fit, surface, threads, progress, full,
     )  # fmt: skip
     pictures["turned"] = turned_sheet(dense)
     return Reconstruction(views, numbered, fit, dense, turned.mirrored, pictures)
+
+
+def _resized(dentition: Dentition | None, view: View) -> Dentition | None:
+    """The dentition in pixels of the photograph at another size."""
+    return dentition and resized_dentition(dentition, (view.width, view.height))
 
 
 def with_numbers(dentition: Dentition, placed: PlacedView | None, fit: ArchFit) -> Dentition:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -76,3 +77,11 @@ class ArchFit:
     def number_of(self, tooth: int) -> int:
         """FDI number of the tooth that stands in the place of a permanent one; 0 for 0."""
         return primary_of(tooth) if tooth in self.primary else tooth
+
+    def enlarged(self, factors: Sequence[float]) -> ArchFit:
+        """The same for photographs so many times as large."""
+        views = (
+            view and replace(view, focal=view.focal * factor, error=view.error * factor)
+            for view, factor in zip(self.views, factors, strict=True)
+        )
+        return replace(self, views=tuple(views))

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 #: Pixel thresholds are given for images of this long side and scale with it.
 REFERENCE_SIDE = 512.0
+#: Squeezed copies, and photographs that are asked how they are rolled, have at most this long side:
+#: what is still alike from far apart is not the finest detail.
+COPIES_SIDE = 640.0
 #: Coherence looks at neighbours this near (pixels at the reference size).
 COHERENCE_RADIUS = 40.0
 #: Bundle adjustment finds a focal length from this many views on (three at 10 to 35 degrees give

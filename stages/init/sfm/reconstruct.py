@@ -19,6 +19,7 @@ from stages.init.sfm.matching.features import (
     describe,
     detect_features,
     joined,
+    reduced,
 )
 from stages.init.sfm.matching.match import (
     candidate_pairs,
@@ -37,6 +38,7 @@ from stages.init.sfm.matching.two_view import (
 )
 from stages.init.sfm.options import (
     COHERENCE_RADIUS,
+    COPIES_SIDE,
     REFERENCE_SIDE,
     VIEWS_PER_FREE_LENS,
     ClassicalOptions,
@@ -147,12 +149,15 @@ def reconstruct(
             return features, solver
         copies = tuple(squeeze for squeeze in options.squeezes if squeeze not in plain)
         turned = sorted({view for pair in far for view in pair}) if copies else []
+        small = [reduced(grays[view], valid[view], COPIES_SIDE) for view in turned]
         more = find_features(
-            [grays[view] for view in turned], [valid[view] for view in turned],
+            [gray for gray, _ in small], [inside for _, inside in small],
             replace(options, squeezes=copies), threads, progress, [rolls[view] for view in turned],
             scratch,
         )  # fmt: skip
-        for view, others in zip(turned, more, strict=True):
+        for view, (gray, _), others in zip(turned, small, more, strict=True):
+            height, width = grays[view].shape
+            others = others.enlarged((width / gray.shape[1], height / gray.shape[0]))
             features[view] = joined(features[view], others, options.merge_radius)
         found |= match_pairs(features, far, options, pixel, threads, progress)
         return features, solver_of(found)
@@ -160,8 +165,11 @@ def reconstruct(
     features, solver = matched([0.0] * len(grays))
     linked = solver.links()
     if refinement.unroll and len(set(groups(linked, len(grays)))) > 1:
+        small = [reduced(*pair, COPIES_SIDE) for pair in zip(grays, valid, strict=True)]
         rolls = find_rolls(
-            grays, valid, linked, options.peak_threshold, pixel, threads, progress
+            [gray for gray, _ in small], [inside for _, inside in small], linked,
+            options.peak_threshold, max(max(gray.shape) for gray, _ in small) / REFERENCE_SIDE,
+            threads, progress,
         )  # fmt: skip
         if any(rolls):
             features, solver = matched(rolls)

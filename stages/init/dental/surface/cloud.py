@@ -74,6 +74,7 @@ class _Layer:
 def coloured_cloud(
     charts: list[Chart],
     photos: list[Photo],
+    shown: list[Photo],
     anchor: int,
     options: SurfaceOptions,
     threads: int,
@@ -82,13 +83,14 @@ def coloured_cloud(
 
     Args:
         charts: of the jaws.
-        photos: the photographs.
+        photos: the photographs, to tell what hides what.
+        shown: the same at the size that colours are taken from.
         anchor: the photograph whose exposure the others are brought to.
         options: settings.
         threads: number of threads.
     """
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
-    layers = [_layer(chart, photos, nearest, options, threads) for chart in charts]
+    layers = [_layer(chart, photos, shown, nearest, options, threads) for chart in charts]
     gains = find_gains(
         [[showing.colour for showing in layer.showings] for layer in layers],
         [layer.weights for layer in layers],
@@ -99,13 +101,14 @@ def coloured_cloud(
     for layer in layers:
         colours = [showing.colour for showing in layer.showings]
         colour, total = blend(colours, layer.weights, gains, layer.grid.density)
-        shown = layer.kept & (total > 0)
+        coloured = layer.kept & (total > 0)
         behind = _behind_other_jaw(layer, charts, photos, threads)
         crowns = behind & within_crowns(layer.grid, layer.chart.shape)
-        seen_tooth = shown & (layer.tooth > 0.5)
-        hidden = hidden_edges(seen_tooth, crowns, layer.grid.density, options.hidden_edge) & ~shown
-        colour = spread_colour(colour, shown)
-        kept = shown | hidden
+        seen_tooth = coloured & (layer.tooth > 0.5)
+        hidden = hidden_edges(seen_tooth, crowns, layer.grid.density, options.hidden_edge)
+        hidden &= ~coloured
+        colour = spread_colour(colour, coloured)
+        kept = coloured | hidden
         agreement = layer.chart.grid.resample(layer.chart.agreement, layer.grid)
         agreement = np.where(hidden, 0, agreement).astype(np.float32)
         number = np.cumsum(kept.ravel()) - 1 + start
@@ -135,6 +138,7 @@ def coloured_cloud(
 def _layer(
     chart: Chart,
     photos: list[Photo],
+    shown: list[Photo],
     nearest: list[Array32],
     options: SurfaceOptions,
     threads: int,
@@ -144,12 +148,12 @@ def _layer(
     points, normals = grid.points(radius), smooth_normals(radius, grid)
     jaw = chart.shape.jaw
 
-    def look(pair: tuple[Photo, Array32]) -> Showing:
-        photo, front = pair
+    def look(item: tuple[Photo, Photo, Array32]) -> Showing:
+        photo, full, front = item
         seen = sees(photo, front, points, HIDDEN)
-        return show(photo, jaw, points, seen, facing(photo, points, normals))
+        return show(full, jaw, points, seen, facing(photo, points, normals))
 
-    showings = in_threads(look, zip(photos, nearest, strict=True), threads)
+    showings = in_threads(look, zip(photos, shown, nearest, strict=True), threads)
     gum, edge = beyond_crowns(grid, chart.shape)
     allowed = (gum < options.gum_height) & (edge < PAST_EDGE)
     kept, tooth = find_tissue(

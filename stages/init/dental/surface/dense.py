@@ -6,7 +6,7 @@ coloured once from all photographs, and seen from each of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -31,7 +31,7 @@ from stages.init.dental.surface.chart.raster import raster_chart
 from stages.init.dental.surface.cloud import coloured_cloud
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
-from stages.init.dental.surface.photo import Photo, prepare_photo
+from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
 from stages.init.dental.surface.sweep import choose_pairs, sweep
 from stages.init.parallel import in_threads
 
@@ -92,6 +92,7 @@ def dense_surface(
     options: SurfaceOptions | None = None,
     threads: int = 1,
     progress: Progress = lambda step, done, total: None,
+    full: Sequence[FullSize | None] = (),
 ) -> ArchSurface:
     """Reconstruct the crowns and a strip of gum from a few wide photographs with known cameras.
 
@@ -103,6 +104,8 @@ def dense_surface(
         options: settings.
         threads: number of threads; does not change the result.
         progress: called with (step, done, total).
+        full: the photographs at the size in which depths and colours are wanted, where that is
+            another one.
 
     Raises:
         ValueError: lists of different length, sizes that don't agree, or no placed photograph.
@@ -114,7 +117,7 @@ def dense_surface(
             f"{len(images)}, {len(valid)}, {len(dentitions)} and {len(fit.views)}"
         )
     with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
-        return _dense_surface(images, valid, dentitions, fit, options, threads, progress)
+        return _dense_surface(images, valid, dentitions, fit, options, threads, progress, full)
 
 
 def _dense_surface(
@@ -125,6 +128,7 @@ def _dense_surface(
     options: SurfaceOptions,
     threads: int,
     progress: Progress,
+    full: Sequence[FullSize | None],
 ) -> ArchSurface:
     steps = 3 + len(options.rounds)
     progress("photographs", 0, steps)
@@ -154,9 +158,13 @@ def _dense_surface(
         smooth = cv2.GaussianBlur(chart.agreement, (0, 0), sigma)
         chart.agreement = np.asarray(smooth, np.float32)
     views: list[SurfaceView | None] = [None] * len(images)
-    looks = in_threads(lambda photo: _look(photo, charts, options), photos, threads)
+    shown = [
+        at_full_size(photo, whole) if full and (whole := full[photo.index]) else photo
+        for photo in photos
+    ]
+    looks = in_threads(lambda photo: _look(photo, charts, options), shown, threads)
     gains = np.ones((len(images), 3))
-    cloud = coloured_cloud(charts, photos, _anchor(photos, fit), options, threads)
+    cloud = coloured_cloud(charts, photos, shown, _anchor(photos, fit), options, threads)
     for photo, view, gain in zip(photos, looks, cloud.gains, strict=True):
         views[photo.index], gains[photo.index] = view, gain
     progress("colour", steps, steps)

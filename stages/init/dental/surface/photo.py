@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -108,6 +108,56 @@ class Photo:
             values, flat[..., 0] - np.float32(0.5), flat[..., 1] - np.float32(0.5), cv2.INTER_LINEAR
         )
         return np.asarray(sampled, np.float32).reshape(pixels.shape[:-1] + values.shape[2:])
+
+
+@dataclass(frozen=True)
+class FullSize:
+    """A photograph at the size that depths and colours are wanted in.
+
+    Attributes:
+        image: [H, W, 3] float32 sRGB in 0..1.
+        valid: [H, W] bool: where it may be used.
+        tooth, above: [H, W] bool, of `Dentition`.
+    """
+
+    image: Array32
+    valid: Mask
+    tooth: Mask
+    above: Mask
+
+
+def at_full_size(photo: Photo, full: FullSize) -> Photo:
+    """A prepared photograph enlarged: what was found in it stays, the picture is that given."""
+    height, width = full.valid.shape
+    if photo.size == (height, width):
+        return photo
+
+    def enlarged(values: Array32) -> Array32:
+        larger = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(larger, np.float32)
+
+    factor = max(width, height) / max(photo.size)
+    camera = photo.camera.copy()
+    camera[12:] = camera[12] * factor, width / 2, height / 2
+    tooth = full.tooth & full.valid
+    # With the teeth, so that no gap opens between them and the gum.
+    tissue = np.max([photo.upper, photo.lower, photo.upper_gum, photo.lower_gum], axis=0)
+    gum = (enlarged(tissue) > 0.5) & full.valid & ~tooth
+    return replace(
+        photo,
+        camera=camera,
+        size=(height, width),
+        density=photo.density * factor,
+        image=np.ascontiguousarray(full.image, np.float32),
+        texture=enlarged(photo.texture),
+        upper=(tooth & full.above).astype(np.float32),
+        lower=(tooth & ~full.above).astype(np.float32),
+        upper_gum=(gum & full.above).astype(np.float32),
+        lower_gum=(gum & ~full.above).astype(np.float32),
+        dull=enlarged(photo.dull),
+        void=((enlarged(photo.void) > 0.5) & full.valid).astype(np.float32),
+        valid=full.valid,
+    )
 
 
 def prepare_photo(

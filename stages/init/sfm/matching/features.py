@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,11 @@ class Features:
             self.positions[:count], self.descriptors[:count], self.scales[:count],
             self.squeezes[:count], self.points[:count], self.roll,
         )  # fmt: skip
+
+    def enlarged(self, factors: tuple[float, float]) -> Features:
+        """Those of a reduced image in pixels of one so many times as wide and high."""
+        scales = self.scales * np.float32(np.sqrt(factors[0] * factors[1]))
+        return replace(self, positions=self.positions * factors, scales=scales)
 
     def largest(self, count: int) -> npt.NDArray[np.int64]:
         """[<= count] indices of the unsqueezed keypoints of the largest scale, largest first."""
@@ -177,6 +182,19 @@ def turned_back(
         flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
     return np.ascontiguousarray(image, np.uint8), original_from_turned
+
+
+def reduced(
+    gray: npt.NDArray[np.uint8], valid: npt.NDArray[np.bool_], side: float
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+    """An image [H, W] uint8 and its mask [H, W] with a long side of at most `side` pixels."""
+    height, width = gray.shape
+    scale = side / max(height, width)
+    if scale >= 1:
+        return gray, valid
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    inside = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8), inside
 
 
 def squeezed(gray: npt.NDArray[np.uint8], squeeze: float) -> npt.NDArray[np.uint8]:
