@@ -9,11 +9,10 @@ from stages.fit.arrays import Array, Bools, Floats, Indices
 from stages.fit.numerics.density import rotations
 
 #: halves of a Gaussian lie this many of its standard deviations from its middle, and are narrower
-#: by this factor: together they are as wide as it was (.5 ** 2 + .85 ** 2 is 1 but for a hundredth,
-#: were they to stay so wide; they start narrower, since what is split is to show more)
+#: by this factor: a little less wide together than it was, since what is split is to show more
 APART, SHRINK = 0.5, 0.6
-#: x ** 2 has this mean absolute value under a kernel that takes out what is even or linear
-#: (Immerkaer 1996, "Fast Noise Variance Estimation")
+#: takes out what is even or linear, and multiplies the deviation of noise by the norm (Immerkaer
+#: 1996, "Fast Noise Variance Estimation")
 LAPLACE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 LAPLACE_NORM = 6.0
 #: median of absolute values to standard deviation, for a normal distribution
