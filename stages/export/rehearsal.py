@@ -6,7 +6,8 @@ import numpy as np
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
-from stages.export.mesh.field import colors_of, fuse, zero_surface
+from stages.export.mesh.field import colors_of, fuse
+from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.surface import Mesh
 from stages.export.pictures.frames import FramePainter
 from stages.export.pictures.preview import shade_mesh

@@ -62,9 +62,9 @@ class Trainer:
         held: int,
         targets: Sequence[dict[int, Target]],
         extent: float,
-        lit: bool = False,
-        scene: Scene | None = None,
-        cloud: Cloud | None = None,
+        lit: bool,
+        scene: Scene,
+        cloud: Cloud | None,
     ) -> None:
         """
         Args:
@@ -75,7 +75,7 @@ class Trainer:
             targets: per view, factor -> target.
             extent: size of the scene that the position rate is relative to.
             lit: by a light beside the lens, in place of harmonics.
-            scene: that it is a fit of; None where only colours are fitted once more.
+            scene: that it is a fit of.
             cloud: the points that became Gaussians; None where they are found view by view.
         """
         self.settings, self.packed, self.targets, self.extent = settings, packed, targets, extent

@@ -8,8 +8,9 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.kernels import kernel_threads
-from stages.export.mesh.field import TRUNCATION, Field, colors_of, fuse, zero_surface
+from stages.export.mesh.field import TRUNCATION, Field, colors_of, fuse
 from stages.export.mesh.files import write_mesh_ply, write_stl
+from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.surface import (
     Mesh,
     drop_small_parts,

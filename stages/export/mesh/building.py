@@ -10,7 +10,8 @@ import numpy as np
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import to_uint8
-from stages.export.mesh.field import TRUNCATION, colors_of, fuse, zero_surface
+from stages.export.mesh.field import TRUNCATION, colors_of, fuse
+from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,

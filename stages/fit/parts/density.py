@@ -160,7 +160,7 @@ class Isotropic(Part, switch="isotropic", on=True, off=False):
 
 
 class Floaters(
-    Part, switch="", needs=("scene",),
+    Part, switch="",
     absent={"final_prune_contribution": 0.0, "final_prune_near": 0.0, "final_prune_masked": 0.0},
 ):  # fmt: skip
     """What is transparent goes in any case."""
@@ -175,7 +175,6 @@ class Floaters(
         have grown out of them (a held surface has a rim and no needles)"""
 
     def __init__(self, fit: Trainer) -> None:
-        assert fit.scene is not None
         self.positions, self.removed = fit.scene.cloud.positions, 0
 
     def end(self, fit: Trainer) -> None:

@@ -94,7 +94,7 @@ class Light(
 
         super().__init__(fit)
         s, scene, cloud = self.settings, fit.scene, fit.cloud
-        assert scene is not None and cloud is not None
+        assert cloud is not None
         images = [view.image for view in scene.views]
         masks = [view.valid() for view in scene.views]
         self.material = numerics.light.initial_material(

@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 UNCOVERED = 0.5
 
 
-class Progressive(
-    Part, switch="progressive", on=True, off=False, needs=("scene",), kept=("placed", "latest")
-):
+class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed", "latest")):
     """Which frames take part yet, and how the next one is added.
 
     Attributes:
@@ -72,7 +70,6 @@ class Progressive(
         from stages.fit.inputs.initial import thin
 
         super().__init__(fit)
-        assert fit.scene is not None
         self.cameras = fit.scene.cameras
         self.order = viewing_order(np.array([camera.centre for camera in self.cameras]))
         self.clouds = [

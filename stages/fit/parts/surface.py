@@ -136,7 +136,7 @@ class Warp(
 
     def __init__(self, fit: Trainer) -> None:
         s, scene, cloud = fit.settings, fit.scene, fit.cloud
-        assert scene is not None and cloud is not None
+        assert cloud is not None
         self.rates = s.warp_lr_init, s.warp_lr_final
         pixel = 1 / max(camera.fx for camera in scene.cameras)
         self.bend = numerics.surface.Warp(
