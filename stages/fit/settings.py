@@ -44,7 +44,7 @@ def automatic(
     views: Mapping[int, Any] | str,
     *,
     held: Any = None,
-    by_size: bool = False,
+    grows: bool = False,
     ge: float | None = 0,
     **bounds: Any,
 ) -> Any:
@@ -54,15 +54,15 @@ def automatic(
         views: what it comes to at so many views, in order; between them it follows the count. Or
             in words, where no table says it.
         held: what it comes to on a held surface, if that is something else.
-        by_size: that is for views of `PIXELS`; it grows with their width.
+        grows: `held` is for views of `PIXELS`, and grows with their width.
         ge, **bounds: of what the user may say.
     """
     if isinstance(views, str):
         extra: dict[str, Any] = {"auto": views}
     else:
         extra = {
-            "auto": _told(views, held) + (" (512 px; it grows with the width)" if by_size else ""),
-            "views": dict(views), "held": held, "by_size": by_size,
+            "auto": _told(views, held) + (" of 512 px (more on wider views)" if grows else ""),
+            "views": dict(views), "held": held, "grows": grows,
         }  # fmt: skip
     return Field(AUTO, json_schema_extra=extra, ge=ge, **bounds)
 

@@ -32,7 +32,8 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         detail: bool = True
         """split Gaussians where the photographs show more than they do, each time the images get
         larger"""
-        detail_density: Positive = 0.3
+        # more between few views gains nothing and costs time; from six on, textured scenes use it
+        detail_density: AutoFloat = automatic({5: 0.3, 6: 0.6}, held=0.3, ge=None, gt=0)
         """there are at most so many Gaussians for each pixel of a photograph; the largest errors
         come first"""
         detail_noise: Annotated[float, Field(ge=0)] = 1.5
