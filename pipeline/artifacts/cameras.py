@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.base import Artifact
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 
 Array = npt.NDArray[np.float64]
 
@@ -87,15 +88,26 @@ class Cameras(Artifact):
         cameras: one entry per placed view, in the order of the views.
         input_from_world: [4, 4] similarity from our world to the frame of known input (a COLMAP
             model, `transforms.json`, millimetres); identity where nothing is known.
-        units: ``"arbitrary"`` or ``"mm"``, of the frame that `input_from_world` leads to.
+        scale: the unit of the frame that `input_from_world` leads to, where it comes from, and how
+            sure it is.
+        given: the user gave the cameras; `input_from_world` leads to their world.
+        mouth_from_world: [4, 4] rotation and shift (in our units) to the frame of the mouth
+            (`pipeline.artifacts.space.frames`), where its teeth tell it.
         provisional: only chained together, without any optimisation; `align` improves them.
     """
 
     kind: ClassVar[str] = "cameras"
     cameras: tuple[Camera, ...]
     input_from_world: Array = field(default_factory=lambda: np.eye(4))
-    units: str = "arbitrary"
+    scale: Scale = NO_SCALE
+    given: bool = False
+    mouth_from_world: Array | None = None
     provisional: bool = False
+
+    @property
+    def units(self) -> str:
+        """``"mm"`` or ``"arbitrary"``."""
+        return "mm" if self.scale.unit == "mm" else "arbitrary"
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -107,7 +119,12 @@ class Cameras(Artifact):
         reconstruction(self.cameras).write_text(str(folder))
         frame = {
             "units": self.units,
+            "scale": self.scale.as_dict(),
             "input_from_world": self.input_from_world.tolist(),
+            "given": self.given,
+            "mouth_from_world": (
+                None if self.mouth_from_world is None else self.mouth_from_world.tolist()
+            ),
             "provisional": self.provisional,
         }
         text = json.dumps(frame, indent=1)
@@ -120,10 +137,15 @@ class Cameras(Artifact):
         if not frame_file.exists():  # a model from elsewhere
             return cls(cameras=cameras)
         frame = json.loads(frame_file.read_text())
+        # Before there was a record of the scale, a file said its unit alone.
+        before = {"unit": "mm" if frame.get("units") == "mm" else "none"}
+        mouth = frame.get("mouth_from_world")
         return cls(
             cameras=cameras,
             input_from_world=np.asarray(frame["input_from_world"], np.float64),
-            units=frame["units"],
+            scale=Scale.from_dict(frame.get("scale", before)),
+            given=bool(frame.get("given", False)),
+            mouth_from_world=None if mouth is None else np.asarray(mouth, np.float64),
             provisional=frame.get("provisional", False),
         )
 

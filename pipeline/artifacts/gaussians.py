@@ -7,6 +7,7 @@ colour behind them, where it is known and not black, is in `background.json`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -105,19 +106,36 @@ class Gaussians(Artifact):
         )  # fmt: skip
 
 
-def ply_properties() -> list[str]:
-    """The 62 property names of a 3DGS `.ply`, in order."""
-    rest = [f"f_rest_{k}" for k in range(3 * (SH_COEFFICIENTS - 1))]
+def ply_properties(degree: int = 3) -> list[str]:
+    """The property names of a 3DGS `.ply`, in order: 62 with harmonics up to degree 3."""
+    rest = [f"f_rest_{k}" for k in range(REST_COUNTS[degree])]
     return [
         "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest,
         "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
     ]  # fmt: skip
 
 
-def write_gaussians_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write the `.ply` that every splat viewer reads (f_rest is channel-major, as in 3DGS)."""
+def ply_comment(text: str) -> str:
+    """A line of a `.ply` header; what is no ASCII is written in words that are."""
+    ascii_only = text.replace("\u00b1", "+-").encode("ascii", "replace").decode("ascii")
+    return "comment " + " ".join(ascii_only.split())
+
+
+def write_gaussians_ply(
+    path: Path, gaussians: Gaussians, degree: int = 3, comments: Iterable[str] = ()
+) -> None:
+    """Write the `.ply` that every splat viewer reads (f_rest is channel-major, as in 3DGS).
+
+    Args:
+        degree: of the harmonics that are written; 3: the 62 properties of 3DGS.
+        comments: lines for the header.
+    """
     count = len(gaussians)
-    rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
+    rest = (
+        gaussians.sh[:, 1 : (degree + 1) ** 2]
+        .transpose(0, 2, 1)
+        .reshape(count, REST_COUNTS[degree])
+    )
     columns = np.concatenate(
         [
             gaussians.means, np.zeros((count, 3), np.float32), gaussians.sh[:, 0], rest,
@@ -125,9 +143,10 @@ def write_gaussians_ply(path: Path, gaussians: Gaussians) -> None:
         ],
         axis=1,
     )  # fmt: skip
-    dtype = np.dtype([(name, "<f4") for name in ply_properties()])
+    dtype = np.dtype([(name, "<f4") for name in ply_properties(degree)])
     rows = np.ascontiguousarray(columns, "<f4").view(dtype).reshape(count)
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+    lines = [ply_comment(text).removeprefix("comment ") for text in comments]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=lines).write(str(path))
 
 
 def read_gaussians_ply(path: Path) -> dict[str, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from pydantic import Field
@@ -115,7 +116,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 3
+    version = 4
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")
@@ -208,7 +209,7 @@ class AlignStage(Stage):
             normals = (normals @ motion[1].T).astype(np.float32)
             cameras = Cameras(tuple(placed))
         else:
-            cameras = Cameras(tuple(placed), given.input_from_world, given.units)
+            cameras = replace(given, cameras=tuple(placed), provisional=False)
         context.save(cameras)
         context.save(
             Points(

@@ -30,8 +30,9 @@ from stages.evaluate.images.perceptual import Lpips
 from stages.evaluate.images.score import Figures, summary_of
 from stages.evaluate.refinement import RefinementOptions, refine_camera
 from stages.evaluate.scene import Examiner
-from stages.evaluate.support import LEGEND, SeenSurface, beyond
+from stages.evaluate.support import LEGEND, beyond
 from stages.evaluate.truth import Truth, read_truth, scoring_mask
+from stages.splatting.support import SeenSurface
 
 #: The input views trained the scene, so that their figures say nothing about unseen views. They
 #: are of final renders at 8 bits; the PSNR that the fit reports on its way is a running mean over

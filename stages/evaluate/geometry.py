@@ -12,8 +12,8 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.mesh import Mesh
 from stages.evaluate.held_out import ALIGNMENT, Registration
-from stages.evaluate.support import SeenSurface, supporting_views
 from stages.evaluate.surface import icp, surface_figures
+from stages.splatting.support import SeenSurface, supporting_views
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
-from stages.evaluate.support import SeenSurface, supporting_views
+from stages.splatting.support import SeenSurface, supporting_views
 
 
 def support() -> None:

@@ -16,13 +16,8 @@ from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.images import pictures
 from stages.evaluate.images.flip import flip_map
 from stages.evaluate.images.score import COVERED, Figures, score_view
-from stages.evaluate.support import (
-    SeenSurface,
-    overlay,
-    seen_surface,
-    support_map,
-    unsupported_share,
-)
+from stages.evaluate.support import overlay, support_map, unsupported_share
+from stages.splatting.support import SeenSurface, seen_surface
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]

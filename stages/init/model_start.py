@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.artifacts.cameras import Cameras
+from pipeline.artifacts.space.scale import said_by_cameras
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
@@ -53,7 +53,7 @@ def from_model(
         views=tuple(view for view, _ in pairs), cameras=tuple(camera for _, camera in pairs),
         points=sparse.positions,
         seen=tuple(sparse.observed[known[view.name].name] for view, _ in pairs),
-        weights={}, units=units,
+        weights={}, scale=said_by_cameras(units), given=True,
     ).normalised()  # fmt: skip
     cameras = {known[camera.name].name: camera for camera in placement.cameras}
     points = as_points(placement.points, sparse.colors, sparse.observed, cameras)
@@ -61,7 +61,7 @@ def from_model(
         points = replace(points, colors=_colours(placement))
     save_all(
         context, views, placement.views,
-        Cameras(placement.cameras, placement.input_from_world, placement.units), [], points, [],
+        placement.placed(), [], points, [],
     )  # fmt: skip
     lengths = sparse.track_lengths()
     context.summarize(sparse_points=len(sparse), track_length=round(float(lengths.mean()), 2))

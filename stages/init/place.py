@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.space.scale import said_by_cameras
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.graph import Pair
@@ -191,7 +192,8 @@ def place_known(
     return Placement(
         views=tuple(placed), cameras=tuple(cameras), points=points, seen=tuple(seen),
         weights={pair: float(len(those)) for pair, those in chosen.items() if len(those)},
-        units=units,
+        scale=said_by_cameras(units),
+        given=True,
         figures={
             "reprojection_error_px": round(float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), 3),
             "matches": sum(len(those) for those in chosen.values()),

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.views import View
 from pipeline.geometry.graph import Pair
 from pipeline.geometry.world import move_camera, normalising_similarity
@@ -28,7 +29,8 @@ class Placement:
         seen: for each of them [K] int64 indices of the points that it observes.
         weights: pairs of them by position -> how well their matches link them.
         input_from_world: [4, 4] similarity to the frame of known input; identity: nothing known.
-        units: ``"mm"`` or ``"arbitrary"``, of that frame.
+        scale: of that frame: its unit, where it comes from, how sure it is.
+        given: the user gave the cameras, and that frame is theirs.
         figures: for the summary.
         links: the matches that the cameras came from, to be drawn; None without.
     """
@@ -39,9 +41,14 @@ class Placement:
     seen: tuple[npt.NDArray[np.int64], ...]
     weights: dict[Pair, float]
     input_from_world: Array = field(default_factory=lambda: np.eye(4))
-    units: str = "arbitrary"
+    scale: Scale = NO_SCALE
+    given: bool = False
     figures: dict[str, float | int | str] = field(default_factory=dict)
     links: Links | None = None
+
+    def placed(self) -> Cameras:
+        """The cameras as they are handed on."""
+        return Cameras(self.cameras, self.input_from_world, self.scale, self.given)
 
     def normalised(self, downs: Sequence[Array] | None = None) -> Placement:
         """The same in a world that is centred, scaled and upright (`normalising_similarity`).

@@ -32,7 +32,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 10
+    version = 12
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -236,11 +236,12 @@ def _with_what_was_set_aside(
     if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
         return unplaced
     names = {view.name: photo_name(view) for view in views.views}
-    aside = [f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside]
+    aside = "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
+    without = f" ({aside})" if aside else ""
     return ReconstructionError(
         f"{unplaced} By their teeth at least {DENTAL_VIEWS[0]} photographs are needed that show "
         f"the closed bite from the front and both sides, and {len(teeth.chosen)} of "
-        f"{len(teeth.views)} do ({'; '.join(aside)}). Add what is missing; if one was set aside "
+        f"{len(teeth.views)} do{without}. Add what is missing; if one was set aside "
         "wrongly or is a mirror image, say so in check.html.",
         unplaced.pictures,
         {**unplaced.artifacts, "teeth": teeth},

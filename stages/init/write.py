@@ -10,20 +10,24 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Cameras
+from pipeline.artifacts.dental.fdi import is_primary
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import Scale, Source
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.geometry import cloud
 from pipeline.geometry.graph import spanning_pairs
 from pipeline.stage import StageContext
 from stages.init.config import InitConfig
+from stages.init.mouth import mouth_frame, textbook_scale, tooth_places
 from stages.init.scale import mm_per_unit, photo_named
 from stages.init.sfm.matching.pictures import Links, match_pictures, match_table
 from stages.stereo import DenseOptions, dense_depths
 
 if TYPE_CHECKING:
+    from pipeline.artifacts.teeth import Teeth
     from stages.init.placement import Placement
 
 Map = npt.NDArray[np.float32]
@@ -75,7 +79,7 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
     ]
     save_all(
         context, views, placement.views,
-        Cameras(cameras, placement.input_from_world, placement.units), depths, result, pairs,
+        placement.placed(), depths, result, pairs,
     )  # fmt: skip
     if placement.links is not None and config.match_pictures:
         save_matches(context, placement.links, config.match_pictures)
@@ -101,6 +105,9 @@ def save_all(
         depths: z-depth [H, W] of each, to measure in.
     """
     config: InitConfig = context.config
+    # points of a model alone have no depth to see a tooth at
+    if cameras.mouth_from_world is None and context.has("teeth") and len(depths) == len(placed):
+        cameras = _with_mouth(context.load("teeth"), placed, cameras, depths)
     if config.length.mm is not None:
         cameras = _scaled(context, views, placed, cameras, depths)
     context.save(cameras)
@@ -118,6 +125,33 @@ def save_all(
         views_registered=len(cameras), views_total=len(views),
         focal=round(float(np.median(focals)), 4), points=len(points),
     )  # fmt: skip
+
+
+def _with_mouth(
+    teeth: Teeth, placed: tuple[View, ...], cameras: Cameras, depths: list[Map]
+) -> Cameras:
+    """The cameras with what the numbered teeth say: how the mouth lies, and how large it is."""
+    places = tooth_places(teeth, placed, cameras.cameras, depths)
+    cameras = replace(cameras, mouth_from_world=mouth_frame(places))
+    scale = textbook_scale(places)
+    # another size than the textbook's: a child's teeth; given cameras keep their own world
+    if scale is None or cameras.given or cameras.scale.unit == "mm" or _primary(teeth):
+        return cameras
+    return _in_millimetres(cameras, scale[0], "textbook_teeth", scale[1])
+
+
+def _primary(teeth: Teeth) -> bool:
+    """Is there a primary tooth among those that are numbered?"""
+    numbers = [crown.number for read in teeth.chosen for crown in read.all_crowns]
+    return any(number and is_primary(number) for number in numbers)
+
+
+def _in_millimetres(cameras: Cameras, factor: float, source: Source, deviation: float) -> Cameras:
+    """The cameras with `factor` millimetres per unit of our world."""
+    before = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
+    input_from_world = np.diag([factor / before] * 3 + [1.0]) @ cameras.input_from_world
+    scale = Scale("mm", source, round(100 * deviation, 2))
+    return replace(cameras, input_from_world=input_from_world, scale=scale)
 
 
 def _differs(view: View, before: View) -> bool:
@@ -148,8 +182,8 @@ def _scaled(
     if _turned_over(placed[number], view):  # start and end are in the photograph as it was taken
         camera = replace(camera, cx=camera.width - camera.cx)
         depth = np.ascontiguousarray(depth[:, ::-1])
-    factor = mm_per_unit(view, camera, depth, length.start, length.end, length.mm)
-    scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
-    input_from_world = np.diag([factor / scale] * 3 + [1.0]) @ cameras.input_from_world
-    context.summarize(mm_per_unit=round(factor, 4))
-    return replace(cameras, input_from_world=input_from_world, units="mm")
+    factor, deviation = mm_per_unit(view, camera, depth, length.start, length.end, length.mm)
+    context.summarize(
+        mm_per_unit=round(factor, 4), scale_uncertainty_percent=round(100 * deviation, 2)
+    )
+    return _in_millimetres(cameras, factor, "length", deviation)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.space.frames import TURNED
 from stages.splatting.frame import move_gaussians
 
+#: Bytes of a `.ply` that its header fits into.
+HEADER = 1 << 14
 #: Natural logarithm of a standard deviation above which its square is not far from overflowing.
 LARGEST_LOG_SCALE = 40.0
 
@@ -26,6 +30,13 @@ def unusable(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
     finite = np.all([np.isfinite(part).all(1) for part in numbers], axis=0)
     turned = np.linalg.norm(gaussians.quats_wxyz.astype(np.float64), axis=1) > 1e-12
     return ~(finite & turned & (gaussians.log_scales < LARGEST_LOG_SCALE).all(1))
+
+
+def says_turned(path: Path) -> bool:
+    """Is it one of our own files, or was made from one, that is turned for viewers?"""
+    with path.open("rb") as file:
+        head = file.read(HEADER).partition(b"end_header")[0]
+    return f"comment {TURNED}".encode("ascii") in head
 
 
 def into_world(gaussians: Gaussians, frame_from_world: npt.NDArray[np.float64]) -> Gaussians:

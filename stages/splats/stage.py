@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
+from pipeline.artifacts.space.frames import WANTED, Wanted
 from pipeline.errors import RequestError
 from pipeline.stage import Stage, StageConfig, StageContext, runtime
 from pipeline.untrusted.paths import GivenPath, user_path
@@ -24,7 +25,8 @@ LITTLE_IN_VIEW = 0.2
 #: What may be wrong with Gaussians that no photograph shows.
 _FRAME_ADVICE = (
     "Train on the cameras that this workspace exports, with the option that keeps their frame "
-    "(OpenSplat: --keep-crs; gsplat: --no-normalize-world-space), or set splats.frame."
+    "(OpenSplat: --keep-crs; gsplat: --no-normalize-world-space), or set splats.frame; for a file "
+    "that was made from our own splats.ply, set splats.turned=true."
 )
 
 
@@ -36,10 +38,13 @@ class SplatsConfig(StageConfig):
         description="Gaussians of another program: a .ply as 3DGS, gsplat, nerfstudio, OpenSplat "
         "and Brush write it. Its contents count, not its place.",
     )
-    frame: Literal["input", "world"] = Field(
-        "input",
-        description="frame that the file is in, as export.frame: input (that of given cameras or "
-        "of a known scale, where there is one) or world (the reconstruction's own)",
+    frame: Wanted = Field(
+        "auto", description=f"frame that the file is in, as export.frame: {WANTED}"
+    )
+    turned: bool | None = Field(
+        None,
+        description="the file is turned by 180 degrees about z against that frame, as our own "
+        "splats.ply is where the exports stand upright; null: as a comment in its header says",
     )
     background: tuple[Channel, Channel, Channel] = Field(
         (0.0, 0.0, 0.0),
@@ -51,7 +56,7 @@ class SplatsStage(Stage):
     """A 3DGS `.ply` -> Gaussians in our world."""
 
     name: ClassVar[str] = "splats"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "take Gaussians that another program fitted (3DGS .ply)"
     Config: ClassVar[type[StageConfig]] = SplatsConfig
     requires: ClassVar[tuple[str, ...]] = ("cameras",)
@@ -75,10 +80,9 @@ class SplatsStage(Stage):
         Raises:
             RequestError: no such file, no splats, none in it, or some that can't be rendered.
         """
-        import numpy as np
-
         from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply
-        from stages.splats.placing import into_world, share_in_view, unusable
+        from pipeline.artifacts.space.frames import VIEWERS_PLY, frame_of
+        from stages.splats.placing import into_world, says_turned, share_in_view, unusable
 
         config: SplatsConfig = context.config
         cameras = context.load("cameras")
@@ -96,7 +100,9 @@ class SplatsStage(Stage):
                 "rendered: they have numbers that are not finite, a rotation of length 0, or a "
                 "size beyond measure (scales are natural logarithms). Remove them, or export again."
             )
-        similarity = cameras.input_from_world if config.frame == "input" else np.eye(4)
+        similarity = frame_of(cameras, config.frame).from_world
+        if says_turned(path) if config.turned is None else config.turned:
+            similarity = VIEWERS_PLY @ similarity
         placed = into_world(given, similarity)
         in_view = share_in_view(placed, cameras.cameras)
         if in_view == 0:

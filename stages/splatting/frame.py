@@ -60,17 +60,18 @@ def move_gaussians(gaussians: Gaussians, similarity: Array) -> Gaussians:
     quats = Rotation.from_quat(gaussians.quats_wxyz[:, [1, 2, 3, 0]].astype(np.float64))
     turned = (Rotation.from_matrix(rotation) * quats).as_quat()[:, [3, 0, 1, 2]]
     means = scale * gaussians.means.astype(np.float64) @ rotation.T + translation
-    sh = np.einsum("ij,njc->nic", harmonics_rotation(rotation), gaussians.sh.astype(np.float64))
+    turn = harmonics_rotation(rotation)
+    sh = np.zeros_like(gaussians.sh)
     for degree in range(4):  # unused degrees stay exactly zero
         block = slice(degree**2, (degree + 1) ** 2)
-        if not np.any(gaussians.sh[:, block]):
-            sh[:, block] = 0
+        if np.any(gaussians.sh[:, block]):
+            sh[:, block] = turn[block, block] @ gaussians.sh[:, block].astype(np.float64)
     return Gaussians(
         means=means.astype(np.float32),
         quats_wxyz=turned.astype(np.float32),
         log_scales=(gaussians.log_scales + np.float32(np.log(scale))).astype(np.float32),
         logit_opacities=gaussians.logit_opacities,
-        sh=sh.astype(np.float32),
+        sh=sh,
         light=_moved_light(gaussians.light, scale, rotation),
         background=gaussians.background,
     )

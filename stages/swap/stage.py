@@ -35,7 +35,7 @@ class SwapStage(Stage):
     """cameras of earlier stages -> those of a model, in the same world."""
 
     name: ClassVar[str] = "swap"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "put a COLMAP model's cameras in place of those of the earlier stages"
     Config: ClassVar[type[StageConfig]] = SwapConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras")
@@ -61,7 +61,6 @@ class SwapStage(Stage):
         """
         from dataclasses import replace
 
-        from pipeline.artifacts.cameras import Cameras
         from pipeline.geometry.models.known_cameras import (
             matching_cameras,
             pinhole_camera,
@@ -96,9 +95,10 @@ class SwapStage(Stage):
         if dropped:
             context.warn(f"The model has no camera of view {', '.join(dropped)}; left out.")
         context.save(
-            Cameras(
-                tuple(moved[view.name] for view in views.views if view.name in moved),
-                present.input_from_world, present.units,
+            replace(
+                present,
+                cameras=tuple(moved[view.name] for view in views.views if view.name in moved),
+                provisional=False,
             )
-        )  # fmt: skip
+        )
         context.summarize(views=len(moved), views_total=len(views))

@@ -16,6 +16,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
@@ -72,7 +73,9 @@ def samples() -> dict[str, Artifact]:
                 Camera("001", 6, 8, 9.0, 9.0, 3.0, 4.0, rigid(rng)),
             ),
             input_from_world=np.diag([2.0, 2, 2, 1]),
-            units="mm",
+            scale=Scale("mm", "length", 2.5),
+            given=True,
+            mouth_from_world=rigid(rng),
         ),
         "points": Points(floats(9, 3), pixels(9, 3), floats(9, 3), 1 + floats(9), floats(9)),
         "flow": Flow((FlowPair("000", "001", floats(5, 7, 2), floats(8, 6, 2), mask, mask),)),

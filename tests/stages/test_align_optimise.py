@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.similarity import refined_pose
 from pipeline.geometry.start import Start, start_from_cameras, start_from_tree
@@ -23,6 +24,8 @@ from tests.stages import dense_scene as scene
 
 ANGLES = (-24.0, -10.0, 4.0, 18.0)
 EVERY_PAIR = tuple(permutations(range(4), 2))
+
+SCALE = Scale("mm", "length", 2.5)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +202,10 @@ def test_no_iterations_or_no_pairs_change_nothing(world):
 def test_provisional_cameras_are_improved_in_their_world(world, tmp_path):
     cameras, images, _ = world
     rough = Cameras(
-        tuple(disturbed(cameras, 1, 1.02).values()), np.diag([2.0, 2, 2, 1]), "mm", True
+        tuple(disturbed(cameras, 1, 1.02).values()),
+        np.diag([2.0, 2, 2, 1]),
+        SCALE,
+        provisional=True,
     )
     context = LocalContext(
         AlignConfig(),
@@ -214,7 +220,7 @@ def test_provisional_cameras_are_improved_in_their_world(world, tmp_path):
     AlignStage().run(context)
     kept = context.result("cameras")
     assert not kept.provisional
-    assert kept.units == "mm"
+    assert kept.scale == SCALE
     np.testing.assert_array_equal(kept.input_from_world, rough.input_from_world)
     rotation, _, focal = errors(kept.by_name(), cameras)
     assert rotation < 0.2

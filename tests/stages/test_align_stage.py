@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.depths import view_depths
@@ -24,6 +25,8 @@ from tests.stages import dense_scene as _scene
 
 ANGLES = (-24.0, -8.0, 6.0, 21.0)
 SIZES = ((128, 96), (120, 96), (128, 96), (96, 80))
+
+SCALE = Scale("mm", "length", 2.5)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +149,8 @@ def test_optimisation_improves_a_disturbed_start(world):
 
 
 def test_known_cameras_stay_and_pair_scales_are_found(world, tmp_path):
-    truth = Cameras(tuple(world[0]), np.diag([3.0, 3.0, 3.0, 1.0]), "mm")
+    mouth = np.diag([-1.0, 1, -1, 1])
+    truth = Cameras(tuple(world[0]), np.diag([3.0, 3.0, 3.0, 1.0]), SCALE, True, mouth)
     pairs = pointmaps(world, 0.0)
     start = start_from_cameras(list(pairs), truth.by_name())
     rng = np.random.default_rng(5)
@@ -157,7 +161,8 @@ def test_known_cameras_stay_and_pair_scales_are_found(world, tmp_path):
     kept = context.result("cameras")
     for found, given in zip(kept.cameras, truth.cameras, strict=True):
         np.testing.assert_allclose(found.cam_from_world, given.cam_from_world, atol=1e-9)
-    assert kept.units == "mm"
+    assert kept.scale == SCALE and kept.given
+    np.testing.assert_array_equal(kept.mouth_from_world, mouth)
     np.testing.assert_array_equal(kept.input_from_world, truth.input_from_world)
     surface = np.concatenate(
         [c.unproject(z).reshape(-1, 3) for c, z in zip(world[0], world[2], strict=True)]

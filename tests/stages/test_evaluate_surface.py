@@ -18,17 +18,9 @@ from stages.evaluate.geometry import geometry_figures
 from stages.evaluate.held_out import register
 from stages.evaluate.images.flip import flip_map
 from stages.evaluate.images.perceptual import VGG_BLOCKS, Lpips, find_vgg_weights
-from stages.evaluate.support import (
-    TINT,
-    SeenSurface,
-    beyond,
-    overlay,
-    seen_surface,
-    support_map,
-    supporting_views,
-    unsupported_share,
-)
+from stages.evaluate.support import TINT, beyond, overlay, support_map, unsupported_share
 from stages.evaluate.surface import f_score, icp, nearest_distances, surface_figures, thinned
+from stages.splatting.support import SeenSurface, seen_surface, supporting_views
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 TWO = np.array([[0, 1, 2], [0, 2, 3]])

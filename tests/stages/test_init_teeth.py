@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.artifacts.dental.corrections import CORRECTIONS
 from pipeline.artifacts.dental.fdi import is_upper
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
@@ -59,7 +60,7 @@ def run(
 def test_outputs_agree_with_each_other_and_lead_back_to_millimetres(tmp_path, monkeypatch):
     context = run(tmp_path, monkeypatch, found_teeth())
     cameras = context.result("cameras")
-    assert cameras.units == "mm" and not cameras.provisional
+    assert cameras.scale == Scale("mm", "textbook_teeth", 15.0) and not cameras.provisional
     for camera, yaw in zip(cameras.cameras, (-40, 0, 40), strict=True):
         mm_from_cam = cameras.input_from_world @ np.linalg.inv(camera.cam_from_world)
         np.testing.assert_allclose(
@@ -103,6 +104,7 @@ def test_known_tooth_width_gives_the_scale(tmp_path, monkeypatch):
         scale_from_widths(found.fit, {16: 10.0})
     context = run(tmp_path, monkeypatch, found, tooth_widths={11: 10.2})
     cameras = context.result("cameras")
+    assert cameras.scale == Scale("mm", "tooth_widths", 4.0)
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
     distance = scale * np.linalg.norm(cameras.cameras[0].centre - cameras.cameras[2].centre)
     truth = np.linalg.norm(

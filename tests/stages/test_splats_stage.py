@@ -16,6 +16,7 @@ from pipeline import cli
 from pipeline.artifacts import gaussians as files
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply, write_gaussians_ply
+from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.runner import RunSummary
 from pipeline.stage import LocalContext
@@ -37,7 +38,7 @@ ONLY_SPLATS = {
 
 
 def in_mm() -> Cameras:
-    return Cameras(scene.ball_cameras(), SIMILARITY, "mm")
+    return Cameras(scene.ball_cameras(), SIMILARITY, Scale("mm"), given=True)
 
 
 def imported(folder: Path, file: Path, cameras: Cameras | None = None, **settings: Any) -> Any:
@@ -75,7 +76,7 @@ def peer_ply(path: Path, gaussians: Gaussians, degree: int = 3, normals: bool = 
     return path
 
 
-@pytest.mark.parametrize("frame", ["input", "world"])
+@pytest.mark.parametrize("frame", ["input", "world", "upright"])
 def test_our_own_export_comes_back_as_it_was(tmp_path: Path, frame: str) -> None:
     case = {**scene.ball_case(), "cameras": in_mm()}
     case["views"] = replace(case["views"], views=case["views"].views[:3])

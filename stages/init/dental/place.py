@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.corrections import (
     CORRECTIONS,
     Corrections,
@@ -19,6 +19,7 @@ from pipeline.artifacts.dental.corrections import (
 )
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import Scale, Source
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.teeth import Teeth as TeethArtifact
 from pipeline.artifacts.views import View, Views
@@ -32,6 +33,7 @@ from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.mouth import mouth_frame
 from stages.init.place import photo_name, with_focals
 from stages.init.placement import Placement
 from stages.init.write import save_all
@@ -139,6 +141,7 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     surface = teeth.surface
     order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
     mm, uncertainty = scale_from_widths(teeth.fit, config.dental.tooth_widths)
+    source: Source = "tooth_widths" if config.dental.tooth_widths else "textbook_teeth"
     mask = config.dental.mask_rest is not False
     cameras = tuple(_camera(teeth.views[k], teeth, k) for k in order)
     rolls = [d.roll if (d := teeth.dentitions[k]) else 0.0 for k in order]
@@ -150,7 +153,8 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
         views=tuple(_masked(teeth.views[k], teeth, k, mask) for k in order),
         cameras=cameras,
         points=surface.positions.astype(np.float64), seen=(), weights={},
-        input_from_world=np.diag([mm, mm, mm, 1.0]), units="mm",
+        input_from_world=np.diag([mm, mm, mm, 1.0]),
+        scale=Scale("mm", source, round(100 * uncertainty, 2)),
     ).normalised(downs)  # fmt: skip
     scale = mm / np.cbrt(np.linalg.det(placement.input_from_world[:3, :3]))
     world_from_mm = np.linalg.inv(placement.input_from_world) @ np.diag([mm, mm, mm, 1.0])
@@ -172,9 +176,15 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
         )
         for i, j in neighbours(cameras)
     ]
+    mouth = mouth_frame(
+        {
+            (mark.kind, mark.tooth): scale * rotation @ place + world_from_mm[:3, 3]
+            for mark, place in teeth.fit.landmarks.items() if mark.kind in ("tip", "zenith")
+        }
+    )  # fmt: skip
     save_all(
         context, views, placement.views,
-        Cameras(cameras, placement.input_from_world, "mm"), depths, points, pairs,
+        replace(placement.placed(), mouth_from_world=mouth), depths, points, pairs,
     )  # fmt: skip
     context.save(Pictures(teeth.pictures))
     context.summarize(
@@ -183,8 +193,8 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     )  # fmt: skip
     if config.length.mm is None and not config.dental.tooth_widths:
         context.warn(
-            f"Millimetres come from textbook teeth and may be {100 * uncertainty:.0f} % off; pass "
-            "a known width, as in --set 'init.dental.tooth_widths={11: 8.6}', for a true scale."
+            f"{placement.scale.text} Pass a known width for a true scale, as in --set "
+            "'init.dental.tooth_widths={11: 8.6}'."
         )
 
 

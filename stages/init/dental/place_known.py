@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED, MEASURED
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import said_by_cameras
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
@@ -138,7 +139,7 @@ def from_known_teeth(
         context.warn(f"The model has no camera of {', '.join(left_out)}; left out.")
     _write(context, views, teeth, centred, Placement(
         views=tuple(placed), cameras=tuple(cameras), points=np.zeros((0, 3)), seen=(), weights={},
-        units=units,
+        scale=said_by_cameras(units), given=True,
     ))  # fmt: skip
 
 
@@ -209,8 +210,8 @@ def _write(
         for view, found in zip(placement.views, dense, strict=True)
     )
     save_all(
-        context, views, shown, Cameras(cameras, placement.input_from_world, placement.units),
-        depths, cloud.thinned(cloud.joined(clouds), config.max_points, context.seed), pairs,
+        context, views, shown, placement.placed(), depths,
+        cloud.thinned(cloud.joined(clouds), config.max_points, context.seed), pairs,
     )  # fmt: skip
     context.save(Pictures(teeth.pictures))
     context.summarize(dense="teeth", dense_points=len(points), **tooth_counts(teeth))

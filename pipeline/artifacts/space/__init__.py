@@ -1,0 +1,1 @@
+"""Where a scene lies: its scale, and the frames it can be given in."""
