@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import html
+import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,3 +48,55 @@ def console(log: str) -> list[str]:
         line for line in log.splitlines()
         if "CONSOLE" in line and "GL Driver Message" not in line
     ]  # fmt: skip
+
+
+def run_in(
+    text: str, script: str, folder: Path, size: tuple[int, int], address: str = ""
+) -> tuple[dict[str, Any], list[str]]:
+    """Run a script in a page; returns what it told, and the messages on the console.
+
+    Args:
+        text: of the page.
+        script: JavaScript, may await; calls `tell(object)` once, when it is done.
+        folder: for the page and the profile.
+        size: of the window; narrower than `NARROWEST` it is a frame.
+        address: see `browse`.
+    """
+    page = folder / f"page{len(list(folder.iterdir()))}.html"
+    page.write_text(text.replace("</body>", _TELL + f"<script>{script}</script></body>"))
+    file = page
+    if size[0] < NARROWEST:
+        file = page.with_name(f"frame_of_{page.name}")
+        file.write_text(_FRAME.format(page.name, html.escape(address), *size))
+        address = ""
+    dom, log = browse(
+        file, folder, (max(size[0], NARROWEST), size[1]), "--dump-dom",
+        "--virtual-time-budget=30000", address=address,
+    )  # fmt: skip
+    told = re.search(r'<pre id="told">(.*?)</pre>', dom, re.S)
+    assert told, f"the script told nothing: {console(log)}"
+    return json.loads(html.unescape(told[1])), console(log)
+
+
+#: Chromium has no narrower windows.
+NARROWEST = 500
+_TELL = """<script>
+function tell(result) {
+  const text = JSON.stringify(result);
+  if (parent !== window) return parent.postMessage(text, "*");
+  const shown = document.createElement("pre");
+  shown.id = "told";
+  shown.textContent = text;
+  document.body.append(shown);
+}
+</script>"""
+_FRAME = """<!doctype html><title>frame</title><body style="margin:0">
+<iframe src="{0}{1}" style="border:0;width:{2}px;height:{3}px"></iframe>
+<script>
+addEventListener("message", (event) => {{
+  const shown = document.createElement("pre");
+  shown.id = "told";
+  shown.textContent = event.data;
+  document.body.append(shown);
+}});
+</script></body>"""

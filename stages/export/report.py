@@ -16,6 +16,9 @@ LINKS = (
     Link("results/viewer.html", "Turn the scene around"),
     Link("results/orbit.mp4", "Video"),
     Link("results/mesh.stl", "Mesh (.stl)"),
+    Link("results/mesh_without_scale.stl", "Mesh without a scale (.stl)"),
+    Link("results/mesh.glb", "Mesh with photographs (.glb)"),
+    Link("results/mesh_without_scale.glb", "Mesh with photographs, without a scale (.glb)"),
     Link("results/splats.ply", "Splats (.ply)"),
     Link("results/README.txt", "What the files are"),
 )

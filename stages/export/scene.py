@@ -16,13 +16,10 @@ from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, ther
 from stages.export.pictures.video import even
 from stages.export.splats import opacities
 from stages.splatting.frame import move_cameras, move_gaussians, move_points
-from stages.splatting.rendering import RenderedView, render
+from stages.splatting.rendering import CONSTANT_HARMONIC, RenderedView, render
 
 Progress = Callable[..., None]
 Pixels = npt.NDArray[np.uint8]
-
-#: constant of the spherical harmonics: colour = .5 + SH_CONSTANT * f_dc
-SH_CONSTANT = 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ def centres(gaussians: Gaussians, least_opacity: float = 0.3) -> Points:
     count = int(kept.sum())
     return Points(
         positions=gaussians.means[kept],
-        colors=np.clip(0.5 + SH_CONSTANT * gaussians.sh[kept, 0], 0, 1).astype(np.float32),
+        colors=np.clip(0.5 + CONSTANT_HARMONIC * gaussians.sh[kept, 0], 0, 1).astype(np.float32),
         normals=np.zeros((count, 3), np.float32),
         confidence=np.full(count, 2, np.float32),
         scale=np.exp(gaussians.log_scales[kept].mean(1)),

@@ -3,84 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
-from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
 from pipeline.installed import library_version
-from pipeline.stage import Parts, Stage, StageConfig, StageContext
+from pipeline.stage import Parts, Stage, StageContext
+from stages.export.config import ExportConfig
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.artifacts.cameras import Cameras
+    from pipeline.artifacts.dental.fdi import Jaw
+    from pipeline.artifacts.space.frames import Frame
+    from pipeline.artifacts.space.scale import Scale
     from pipeline.artifacts.teeth import Teeth
     from pipeline.artifacts.views import Views
+    from stages.export.measuring.mouth import Mouth
     from stages.export.mesh.surface import Mesh
     from stages.export.scene import Scene
-
-
-class ExportConfig(StageConfig):
-    frame: Literal["input", "world"] = Field(
-        "input",
-        description="frame of all exports: input (that of given cameras or of a known scale, where "
-        "there is one) or world (the reconstruction's own)",
-    )
-    colmap: bool = Field(True, description="write the COLMAP model and transforms.json")
-    colmap_points: int = Field(
-        50_000, ge=0, le=2_000_000, description="points in the COLMAP model and points.ply, at most"
-    )
-    mesh: bool = Field(True, description="write mesh.ply and mesh.stl")
-    mesh_method: Literal["tsdf", "poisson"] = Field(
-        "tsdf",
-        description="tsdf: fuse depth rendered from the Gaussians; poisson: surface through the "
-        "points",
-    )
-    mesh_faces: int = Field(60_000, ge=100, le=5_000_000, description="triangles, at most")
-    mesh_resolution: int = Field(
-        256, ge=32, le=1024, description="voxels across what a photograph shows"
-    )
-    mesh_cell: Literal[1, 2, 4, 8] = Field(
-        2, description="edge of the mesh's cells in voxels; finer detail is evened out"
-    )
-    mesh_views: int = Field(
-        12, ge=0, le=500, description="viewpoints between the photographs that are fused as well"
-    )
-    mesh_depth: float = Field(
-        2.0,
-        gt=0,
-        le=100,
-        description="the mesh reaches this far behind the scene's centre, in half widths of what a "
-        "photograph shows",
-    )
-    mesh_confidence: float = Field(
-        FILLED,
-        ge=0,
-        description="only points with a confidence above this support the mesh: up to it their "
-        "depth was filled in, not measured",
-    )
-    video: bool = Field(True, description="write orbit.mp4")
-    video_seconds: float = Field(8.0, ge=0.5, le=120, description="length of one loop")
-    video_fps: int = Field(25, ge=1, le=60, description="frames per second")
-    video_crf: int = Field(20, ge=0, le=51, description="x264 quality: smaller is better, larger")
-    video_sway: float = Field(2.0, ge=0, le=30, description="rise and fall on the way, in degrees")
-    viewer: bool = Field(True, description="write viewer.html")
-    viewer_photos: bool = Field(
-        True, description="embed the photographs in the page, for thumbnails and comparison"
-    )
-    viewer_photo_quality: int = Field(80, ge=10, le=100, description="their JPEG quality")
-    viewer_sh_degree: int = Field(
-        3, ge=0, le=3, description="highest spherical-harmonics degree that the page carries"
-    )
-    preview: bool = Field(True, description="write preview.png")
+    from stages.export.viewer.page import Knowledge
 
 
 class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 4
+    version = 8
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -105,10 +57,11 @@ class ExportStage(Stage):
         return PARTS
 
     def run(self, context: StageContext) -> None:
-        from pipeline.artifacts.gaussians import write_gaussians_ply
+        from pipeline.artifacts.space.frames import frame_of
+        from pipeline.artifacts.space.scale import NO_SCALE
         from stages.export.mesh.building import build_mesh
-        from stages.export.mesh.files import write_mesh_ply, write_stl
         from stages.export.scene import assemble
+        from stages.export.splatfiles.writing import write_splats
 
         config: ExportConfig = context.config
         views, cameras = context.load("views"), context.load("cameras")
@@ -116,16 +69,20 @@ class ExportStage(Stage):
             raise ReconstructionError(
                 "There is nothing to export: none of the photographs could be placed."
             )
+        frame = frame_of(cameras, config.frame)
+        if frame.lacking:
+            context.warn(frame.lacking)
+        scale = NO_SCALE if frame.name == "world" else cameras.scale
+        comments = [f"dentalsplat: {scale.text}"]
         scene = assemble(
             views,
             cameras,
             context.load("gaussians"),
             context.load("points") if context.has("points") else None,
-            cameras.input_from_world if config.frame == "input" else np.eye(4),
+            frame.from_world,
             context.threads,
             context.progress,
         )
-        units = cameras.units if config.frame == "input" else "arbitrary"
         folder = context.output("exports")
         counts = {
             "photographs": len(views),
@@ -133,11 +90,15 @@ class ExportStage(Stage):
             "gaussians": len(scene.gaussians),
         }
         skipped: dict[str, str] = {}
-        write_gaussians_ply(folder / "splats.ply", scene.gaussians)
+        context.progress("splats", 0, 1)
+        write_splats(folder, scene, frame.stands, comments, config.splat_files)
+        context.progress("splats", 1, 1)
         if config.colmap:
-            counts["colmap_points"] = _write_cameras(context, scene, folder, units)
+            counts["colmap_points"] = _write_cameras(context, scene, folder, scale)
+        mouth, teeth = None, None
         if context.has("teeth"):
-            counts |= _write_teeth(context, views, scene, folder, config.frame, units)
+            mouth, teeth = _write_teeth(context, views, scene, folder, frame, scale)
+            counts |= {"teeth": len(teeth["teeth"])} if teeth else {}
         mesh = None
         if config.mesh:
             mesh = build_mesh(
@@ -147,13 +108,15 @@ class ExportStage(Stage):
             )  # fmt: skip
             context.progress("mesh", 1, 1)
         frames = _write_video(context, scene, folder) if config.video else None
-        page_bytes = _write_page(context, scene, folder) if config.viewer else 0
+        page_bytes = 0
+        if config.viewer:
+            known = _knowledge(scene, frame, scale, mouth, teeth, mesh)
+            page_bytes = _write_page(context, scene, folder, known)
         if mesh is not None:
-            write_mesh_ply(folder / "mesh.ply", mesh)
-            write_stl(folder / "mesh.stl", mesh)
+            _write_mesh(context, cameras, scene, mesh, mouth, folder, frame, scale, skipped)
             counts["mesh_faces"] = len(mesh)
         elif config.mesh:
-            skipped["mesh.ply, mesh.stl"] = "too little surface for a mesh"
+            skipped["mesh"] = "too little surface for a mesh"
             context.warn(
                 "No mesh was made: too little of the surface is known. More photographs that "
                 "overlap would help; the other exports are complete."
@@ -162,7 +125,7 @@ class ExportStage(Stage):
             counts["video_frames"] = frames
         if config.preview:
             _write_preview(context, scene, mesh, folder)
-        _describe(scene, folder, config.frame, units, counts, skipped, self.libraries)
+        _describe(scene, folder, frame, scale, counts, skipped, self.libraries)
         context.summarize(
             splats=len(scene.gaussians),
             mesh_faces=counts.get("mesh_faces", 0),
@@ -170,7 +133,44 @@ class ExportStage(Stage):
         )
 
 
-def _write_cameras(context: StageContext, scene: Scene, folder: Path, units: str) -> int:
+def _write_mesh(
+    context: StageContext, cameras: Cameras, scene: Scene, mesh: Mesh, mouth: Mouth | None,
+    folder: Path, frame: Frame, scale: Scale, skipped: dict[str, str],
+) -> None:  # fmt: skip
+    """The mesh together and jaw by jaw, with colours, for slicers, with a texture, as models."""
+    from stages.export.mesh.jaws import crown_maps, jaws_of
+    from stages.export.mesh.texture.atlas import textured
+    from stages.export.mesh.texture.sight import sights
+    from stages.export.mesh.writing import Writer, write_meshes, write_models
+
+    config: ExportConfig = context.config
+    context.progress("mesh files", 0, 1)
+    seen = sights(mesh, scene.cameras, scene.masks)
+    colored = None
+    if config.mesh_texture:
+        photos = [scene.photos[camera.name] for camera in scene.cameras]
+        colored = textured(mesh, seen, photos, config.mesh_texture)
+    jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
+    if mouth is not None and (config.mesh_jaws or config.mesh_base):
+        jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
+    writer = Writer(folder, frame, scale)
+    write_meshes(writer, mesh, colored, jaws if config.mesh_jaws else {})
+    if config.mesh_base:
+        context.progress("closed models", 0, 1)
+        lacking = write_models(
+            writer, mesh, jaws, cameras.mouth_from_world, config.mesh_base_height,
+            config.mesh_base_depth, config.mesh_faces,
+        )  # fmt: skip
+        if lacking:
+            skipped["model"] = lacking
+            context.warn(
+                "Not every closed model that was asked for (export.mesh_base) was made: "
+                f"{lacking}. The other exports are complete."
+            )
+    context.progress("mesh files", 1, 1)
+
+
+def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Scale) -> int:
     """COLMAP model with its images, `points.ply`, `transforms.json`; returns the points written."""
     from pipeline.artifacts.views import to_uint8
     from stages.export import models
@@ -189,7 +189,9 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, units: str
     depths = [view.depth for view in scene.seen]
     count = models.write_colmap(model, scene.cameras, cloud.positions, colors, depths)
     models.write_cloud(folder / "points.ply", cloud.positions, colors)
-    notes = {"dentalsplat_units": units}
+    notes: dict[str, Any] = {"dentalsplat_scale": scale.as_dict()}
+    if scale.unit == "mm":
+        notes["units"] = "mm"
     transforms = models.nerfstudio_transforms(scene.cameras, scene.masked, notes)
     models.write_json(folder / "transforms.json", transforms)
     context.progress("COLMAP model", 1, 1)
@@ -197,20 +199,57 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, units: str
 
 
 def _write_teeth(
-    context: StageContext, views: Views, scene: Scene, folder: Path, frame: str, units: str
-) -> dict[str, int]:
-    """`teeth.json`, if there are teeth; returns their count, if so."""
+    context: StageContext, views: Views, scene: Scene, folder: Path, frame: Frame, scale: Scale
+) -> tuple[Mouth | None, dict[str, Any] | None]:
+    """`teeth.json` and `teeth.csv`, if there are teeth; returns both, measured."""
+    from stages.export.measuring.measures import NOTES
+    from stages.export.measuring.mouth import read_mouth
     from stages.export.models import write_json
     from stages.export.teeth import describe_teeth
+    from stages.export.teeth_table import teeth_table
 
     teeth: Teeth = context.load("teeth")
     if not teeth.chosen:
-        return {}
-    found = describe_teeth(
-        teeth, views, scene.cameras, scene.seen, _frame_name(scene, frame), units
-    )
+        return None, None
+    found = describe_teeth(teeth, views, scene.cameras, scene.seen, frame.name, scale)
+    mouth = read_mouth(teeth, views, scene.cameras, scene.seen, scene.orbit.up, scale.as_dict())
+    found |= {"measurement_notes": NOTES, "measurements": list(mouth.measurements)}
     write_json(folder / "teeth.json", found)
-    return {"teeth": len(found["teeth"])}
+    (folder / "teeth.csv").write_text(teeth_table(found), encoding="utf-8")
+    return mouth, found
+
+
+def _knowledge(
+    scene: Scene, frame: Frame, scale: Scale, mouth: Mouth | None,
+    teeth: dict[str, Any] | None, mesh: Mesh | None,
+) -> Knowledge:  # fmt: skip
+    """What the viewer shows beside the scene."""
+    from stages.export.texts import describe_frame
+    from stages.export.viewer.knowledge import (
+        coarse,
+        directions,
+        jaws_of,
+        photographs_that_saw,
+        seen_surfaces,
+    )
+    from stages.export.viewer.page import Knowledge
+
+    surfaces = seen_surfaces(scene.cameras, scene.seen, scene.masks)
+    dentitions = mouth.dentitions if mouth else {}
+    overlay = None
+    if mesh is not None:
+        vertices, faces = coarse(mesh.vertices, mesh.faces)
+        overlay = vertices, faces, jaws_of(vertices, surfaces, dentitions)
+    return Knowledge(
+        scale=scale.as_dict(),
+        frame=describe_frame(frame),
+        teeth=directions(teeth["teeth"], scene.cameras) if teeth else (),
+        measurements=mouth.measurements if mouth else (),
+        axes=mouth.axes if mouth else None,
+        jaws=jaws_of(scene.gaussians.means, surfaces, dentitions),
+        seen=photographs_that_saw(scene.gaussians.means, surfaces),
+        mesh=overlay,
+    )
 
 
 def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
@@ -221,9 +260,9 @@ def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 
 def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
-    from stages.export.page import rasterizer_constants
     from stages.export.pictures.frames import FramePainter
     from stages.export.pictures.video import Video
+    from stages.export.viewer.page import rasterizer_constants
 
     config: ExportConfig = context.config
     places, place_of_frame = scene.path(config.video_seconds, config.video_fps, config.video_sway)
@@ -243,8 +282,8 @@ def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
     return len(place_of_frame)
 
 
-def _write_page(context: StageContext, scene: Scene, folder: Path) -> int:
-    from stages.export.page import build_page, rasterizer_constants
+def _write_page(context: StageContext, scene: Scene, folder: Path, knowledge: Knowledge) -> int:
+    from stages.export.viewer.page import build_page, rasterizer_constants
 
     config: ExportConfig = context.config
     context.progress("viewer page", 0, 1)
@@ -252,7 +291,7 @@ def _write_page(context: StageContext, scene: Scene, folder: Path) -> int:
         scene.gaussians, scene.cameras, scene.orbit,
         scene.photos if config.viewer_photos else {},
         rasterizer_constants(scene.gaussians, scene.cameras),
-        config.viewer_sh_degree, config.viewer_photo_quality,
+        config.viewer_sh_degree, config.viewer_photo_quality, knowledge,
     )  # fmt: skip
     context.progress("viewer page", 1, 1)
     return (folder / "viewer.html").write_bytes(page.encode())
@@ -282,16 +321,11 @@ def _write_preview(
     context.progress("preview", 1, 1)
 
 
-def _frame_name(scene: Scene, frame: str) -> str:
-    """What the frame of the exports is called: "world" where no other is known."""
-    return "world" if np.array_equal(scene.frame_from_world, np.eye(4)) else frame
-
-
 def _describe(
     scene: Scene,
     folder: Path,
-    frame: str,
-    units: str,
+    frame: Frame,
+    scale: Scale,
     counts: dict[str, int],
     skipped: dict[str, str],
     libraries: tuple[str, ...],
@@ -302,10 +336,9 @@ def _describe(
 
     description = scene_description(
         files=sorted(path.name for path in folder.iterdir()),
-        frame=_frame_name(scene, frame),
-        units=units,
+        frame=frame,
+        scale=scale,
         up=scene.orbit.up.tolist(),
-        similarity=scene.frame_from_world.tolist(),
         counts=counts,
         skipped=skipped,
         versions={name: library_version(name) for name in ("dentalsplat", *libraries)},

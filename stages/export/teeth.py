@@ -1,9 +1,9 @@
-"""`teeth.json`: every tooth with its numbers, its place in 3D and its outlines."""
+"""`teeth.json`: every tooth with its numbers, its place in 3D and its outlines; `teeth.csv`."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import is_primary, is_upper, universal_number
-from pipeline.artifacts.teeth import Dentition, Teeth, filled
+from pipeline.artifacts.space.scale import Scale
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth, filled
 from pipeline.artifacts.views import View, Views
 from stages.splatting.rendering import RenderedView
 
@@ -36,6 +37,9 @@ NOTES = {
     "exports (scene.json); null: nothing is known of its depth",
     "spread": "largest distance between that middle as single photographs have it and the centre; "
     "null: one photograph at most",
+    "width, height": "of the crown along and across its row, at its depth, in the photograph that "
+    "shows most of it: it is foreshortened there, so the tooth has at least that; null: no "
+    "photograph shows all of it",
     "outline": "closed polygon in pixels of colmap/images/PHOTOGRAPH.png, x to the right, y down, "
     "pixel centres at .5",
 }
@@ -52,6 +56,7 @@ class SeenCrown:
         outline: [K, 2] pixels of the exported image.
         centre: [3] median of the surface inside the outline, frame of the exports, or None.
         pixels: where it has depth.
+        width, height: in units of the exports, as this photograph shows them, or None.
     """
 
     photograph: str
@@ -60,6 +65,8 @@ class SeenCrown:
     outline: Array
     centre: Array | None
     pixels: int
+    width: float | None = None
+    height: float | None = None
 
 
 def describe_teeth(
@@ -68,7 +75,7 @@ def describe_teeth(
     cameras: Sequence[Camera],
     seen: Sequence[RenderedView],
     frame: str,
-    units: str,
+    scale: Scale,
 ) -> dict[str, Any]:
     """The content of `teeth.json`. No file name of the user's is in it.
 
@@ -82,7 +89,7 @@ def describe_teeth(
         views: the photographs as the scene was made of them.
         cameras: of the placed ones, in the frame of the exports.
         seen: the scene as each of these cameras sees it.
-        frame, units: of the exports, as `scene.json` has them.
+        frame, scale: of the exports, as `scene.json` has them.
     """
     by_name = views.by_name()
     read = teeth.by_name()
@@ -97,7 +104,8 @@ def describe_teeth(
     return {
         "format": FORMAT,
         "frame": frame,
-        "units": units,
+        "units": "mm" if scale.unit == "mm" else "arbitrary",
+        "scale": scale.as_dict(),
         "notes": NOTES,
         "teeth": [_tooth([c for c in crowns if c.number == number]) for number in numbers],
         "photographs": shown,
@@ -120,8 +128,29 @@ def _seen_crowns(
         inside = known & filled((replace(crown, outline=outline),), size)
         pixels = int(inside.sum())
         centre = np.median(world[inside], axis=0) if pixels >= LEAST_PIXELS else None
-        found.append(SeenCrown(camera.name, crown.number, crown.doubt, outline, centre, pixels))
+        width, height = _seen_size(crown, dentition, view, camera, centre)
+        found.append(
+            SeenCrown(
+                camera.name, crown.number, crown.doubt, outline, centre, pixels, width, height
+            )
+        )  # fmt: skip
     return found
+
+
+def _seen_size(
+    crown: Crown, dentition: Dentition, view: View, camera: Camera, centre: Array | None
+) -> tuple[float | None, float | None]:
+    """Width and height of a crown at its depth, as one photograph shows them.
+
+    Nothing of a crown whose outline is weak or goes on unseen; an occlusal photograph shows how
+    thick a tooth is, not how high.
+    """
+    if centre is None or crown.doubtful or crown.cut_left or crown.cut_right:
+        return None, None
+    depth = float(camera.project(centre[None])[1][0])
+    unit = depth / camera.fx * view.width / dentition.size[0]
+    occlusal = dentition.kind in ("upper", "lower")
+    return crown.width * unit, None if occlusal else crown.height * unit
 
 
 def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array:
@@ -172,6 +201,8 @@ def _tooth(crowns: Sequence[SeenCrown]) -> dict[str, Any]:
         "doubt": _rounded(min(crown.doubt for crown in crowns)),
         "centre": None if centre is None else [_significant(value) for value in centre],
         "spread": None if spread is None else _significant(spread),
+        "width": _largest(crown.width for crown in crowns),
+        "height": _largest(crown.height for crown in crowns),
         "seen_in": [
             {
                 "photograph": crown.photograph,
@@ -225,6 +256,11 @@ def without_names(reason: str, views: Mapping[str, View]) -> str:
     if known and re.search(rf"\bthe same as ({known})(?=, which|$)", reason):
         return reason
     return _OTHER_PHOTO.sub("the same as another photograph", reason)
+
+
+def _largest(sizes: Iterable[float | None]) -> float | None:
+    known = [size for size in sizes if size is not None]
+    return _significant(max(known)) if known else None
 
 
 def _rounded(doubt: float) -> float:

@@ -2,27 +2,65 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
+
+from pipeline.artifacts.space.frames import Frame
+from pipeline.artifacts.space.scale import Scale
+from stages.export.mesh.files import WITHOUT_SCALE
+from stages.export.orientation import file_from_frame
+
+
+def _meshes() -> dict[str, str]:
+    """What the files of the mesh are, whole and in parts, with and without a scale."""
+    found = {}
+    for end, said in (("", ""), (WITHOUT_SCALE, "; nothing can be measured on it")):
+        for part, whose in (
+            ("", ""),
+            ("_upper", " of the upper jaw"),
+            ("_lower", " of the lower jaw"),
+        ):
+            stem = f"mesh{part}{end}"
+            found[f"{stem}.ply"] = f"triangle mesh{whose} with colours{said}"
+            found[f"{stem}.glb"] = "the same with the photographs on it, for 3D viewers"
+            found[f"{stem}.stl"] = "the same without colours, for slicers and CAD"
+    return found
+
 
 DESCRIPTIONS = {
     "viewer.html": "the scene to look at: open it in a browser; works from disk, sends nothing",
     "preview.png": "one picture: photograph, the 3D scene from the same place, a new viewpoint",
     "orbit.mp4": "a walk around the scene through the places of the photographs",
     "splats.ply": "3D Gaussians in the standard 3DGS layout, for SuperSplat and other viewers",
-    "mesh.ply": "triangle mesh with colours",
-    "mesh.stl": "the same mesh without colours",
+    "splats_constant_colour.ply": "the same for viewers that show one colour a Gaussian: the mean "
+    "of what the photographs' cameras see",
+    "splats.compressed.ply": "the same, small, for SuperSplat and PlayCanvas",
+    "splats.spz": "the same, small, for viewers that read Niantic's .spz",
+    **_meshes(),
+    "model_upper.stl": "upper jaw, closed and with a base, for printing",
+    "model_lower.stl": "lower jaw, closed and with a base, for printing",
     "points.ply": "thinned point cloud with colours",
     "colmap": "COLMAP model: images, and cameras and points in sparse/0",
     "transforms.json": "the cameras for nerfstudio (ns-train splatfacto --data .)",
     "teeth.json": "the teeth: FDI and Universal number, doubt, place in 3D, outlines in the images",
+    "teeth.csv": "the same as a table, a row for each tooth",
 }
 
 TEETH = """\
 
-Teeth. teeth.json has {teeth} teeth. "doubt" is the probability that a number is wrong; check those
-above .2. "centre" is the middle of what is seen of a crown, in the frame above. Outlines are pixels
-of colmap/images. Photographs that were set aside are named there, with the reason.
+Teeth. teeth.json has {teeth} teeth, teeth.csv a row for each. "doubt" is the probability that a
+number is wrong; check those above .2. "centre" is the middle of what is seen of a crown, in the
+frame above. Outlines are pixels of colmap/images. Photographs that were set aside are named there,
+with the reason.
+"""
+
+MODELS = """
+Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print. Their
+outside is the mesh. The back and the base are made up, not measured: the photographs do not show
+them.
 """
 
 README = """\
@@ -31,23 +69,73 @@ dentalsplat export
 
 {files}
 
-Frame. All files share one frame: {frame}.
+Scale. {scale}
+
+Frame. {frame}
 Axes are right-handed. Up in the photographs is ({up[0]:.4f}, {up[1]:.4f}, {up[2]:.4f}).
 Cameras in colmap/ are OpenCV cameras (x right, y down, z forward); those in transforms.json
 have OpenGL axes (x right, y up, z backward) in the same world.
-Lengths are in {units}.{caution}
-{teeth}
+{turned}{metres}
+{teeth}{models}
 {placed} of {total} photographs could be placed. They appear as 000, 001, ... in the order in which
 they were given; no file names, places or times are carried along.
 """
 
 
+#: Name of a frame -> its axes, its origin, and all that for people.
+FRAMES: dict[str, tuple[str, str, str]] = {
+    "mouth": (
+        "x to the patient's left, y up, z to the front, towards the viewer",
+        "between the edges of the upper central incisors, in the occlusal plane (y = 0)",
+        "All files share the frame of the mouth: x leads to the patient's left, y up, z to the "
+        "front,\ntowards the viewer. The origin lies between the edges of the upper central "
+        "incisors (or of the\nforemost pair of teeth that is seen), in the occlusal plane, which "
+        "is y = 0: the plane nearest to\nthe edges and cusps of the upper teeth.",
+    ),
+    "upright": (
+        "x right, y up, z towards the viewer, as the photographs show it",
+        "the middle of what the photographs show",
+        "All files stand as the photographs show the scene: x leads to the right, y up, z towards "
+        "the\nviewer. The origin is in the middle of what the photographs show.",
+    ),
+    "input": (
+        "those of the cameras that were given",
+        "that of the cameras that were given",
+        "All files are in the frame of the cameras that were given.",
+    ),
+    "world": (
+        "the reconstruction's own: x right, y down, z away from the viewer",
+        "the middle of what the photographs show",
+        "All files are in the reconstruction's own frame; its scale is arbitrary.",
+    ),
+}
+TURNED = """\
+Two kinds of files are turned against that frame, as their readers expect it: splats*.ply by 180
+degrees about z, for SuperSplat, and .stl by 90 degrees about x, so that z is up. scene.json has the
+matrices.
+"""
+METRES = """\
+Lengths in .glb files are in metres, as their readers expect it; in all others in millimetres.
+"""
+
+
+def describe_frame(frame: Frame) -> dict[str, Any]:
+    """The frame of the exports, as `scene.json` and the viewer page hold it."""
+    axes, origin, _ = FRAMES[frame.name]
+    return {
+        "name": frame.name,
+        "axes": axes,
+        "origin": origin,
+        "handedness": "right",
+        "frame_from_world": frame.from_world.tolist(),
+    }
+
+
 def scene_description(
     files: Sequence[str],
-    frame: str,
-    units: str,
+    frame: Frame,
+    scale: Scale,
     up: Sequence[float],
-    similarity: Sequence[Sequence[float]],
     counts: Mapping[str, int],
     skipped: Mapping[str, str],
     versions: Mapping[str, str],
@@ -56,24 +144,28 @@ def scene_description(
 
     Args:
         files: top-level names in the export folder.
-        frame: ``input`` (of what the user gave) or ``world`` (ours).
-        units: ``mm`` or ``arbitrary``, of that frame.
+        frame: of the exports.
+        scale: of that frame.
         up: direction in that frame that is up in the photographs.
-        similarity: [4, 4] matrix that led from our world into the frame.
         counts: what there is how many times.
         skipped: what could not be made -> why.
         versions: of dentalsplat and of the libraries that made the files.
     """
     return {
-        "format": "dentalsplat export 1",
+        "format": "dentalsplat export 2",
         "files": {name: DESCRIPTIONS[name] for name in DESCRIPTIONS if name in files},
+        "scale": scale.as_dict(),
         "frame": {
-            "name": frame,
-            "units": units,
-            "handedness": "right",
+            **describe_frame(frame),
+            "units": "mm" if scale.unit == "mm" else "arbitrary",
             "camera_axes": "OpenCV: x right, y down, z forward (transforms.json: OpenGL)",
             "up": list(up),
-            "frame_from_world": [list(row) for row in similarity],
+            "file_from_frame": {
+                name: turn.tolist()
+                for name in sorted(files)
+                for turn in [file_from_frame(name, frame.stands, scale.unit == "mm")]
+                if not np.array_equal(turn, np.eye(4))
+            },
         },
         "counts": dict(counts),
         "skipped": dict(skipped),
@@ -86,17 +178,14 @@ def readme(scene: Mapping[str, Any]) -> str:
     frame = scene["frame"]
     width = max(map(len, scene["files"]), default=0) + 2
     lines = [f"{name:<{width}}{what}" for name, what in scene["files"].items()]
-    metric = frame["units"] == "mm"
     return README.format(
         files="\n".join(lines),
-        frame=(
-            "the frame of the cameras or the scale that were given"
-            if frame["name"] == "input"
-            else "the reconstruction's own (its scale and orientation are arbitrary)"
-        ),
+        scale=textwrap.fill(scene["scale"]["text"], 100, initial_indent=" " * 7)[7:],
+        frame=FRAMES[frame["name"]][2],
+        turned=TURNED if any(name.endswith(".ply") for name in frame["file_from_frame"]) else "",
+        metres=METRES if any(name.endswith(".glb") for name in frame["file_from_frame"]) else "",
+        models=MODELS if any(name.startswith("model_") for name in scene["files"]) else "",
         up=frame["up"],
-        units="millimetres" if metric else "arbitrary units",
-        caution="" if metric else " Nothing can be measured in them: no scale was known.",
         placed=scene["counts"]["placed_photographs"],
         total=scene["counts"]["photographs"],
         teeth=TEETH.format(**scene["counts"]) if "teeth" in scene["counts"] else "",

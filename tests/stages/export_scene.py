@@ -100,3 +100,12 @@ def ball_case() -> dict:
         "gaussians": gaussians,
         "points": ball_points(),
     }
+
+
+def ball_depth(camera: Camera) -> np.ndarray:
+    """Exact depth of the unit ball, 0 beside it."""
+    direction = camera.unproject(np.ones((camera.height, camera.width))) - camera.centre
+    b = direction @ camera.centre
+    a = (direction**2).sum(-1)
+    root = b**2 - a * (camera.centre @ camera.centre - 1)
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)

@@ -13,6 +13,7 @@ import pytest
 
 from pipeline.artifacts.cameras import Cameras, read_colmap
 from pipeline.artifacts.gaussians import read_gaussians_ply
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views, read_png, to_uint8
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
@@ -22,6 +23,7 @@ from tests.stages import export_scene as scene
 
 #: our world -> the input's millimetres
 SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])
+IN_MM = Scale("mm", "length", 2.5)
 SMALL = {
     "mesh_faces": 2000, "mesh_resolution": 64, "mesh_views": 3, "video_seconds": 0.8,
     "video_fps": 10, "colmap_points": 400,
@@ -42,7 +44,9 @@ def metric_case() -> dict:
     mask[:10] = False
     first = replace(case["views"].views[0], mask=mask)
     case["views"] = Views((first, *case["views"].views[1:]))
-    case["cameras"] = Cameras(case["cameras"].cameras, input_from_world=SIMILARITY, units="mm")
+    case["cameras"] = Cameras(
+        case["cameras"].cameras, input_from_world=SIMILARITY, scale=IN_MM, given=True
+    )
     return case
 
 
@@ -67,8 +71,9 @@ def bytes_of(folder: Path) -> dict[str, str]:
 def test_everything_is_there_and_counted(exported: LocalContext, folder: Path) -> None:
     description = json.loads((folder / "scene.json").read_text())
     assert set(description["files"]) == {
-        "viewer.html", "preview.png", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl",
-        "points.ply", "colmap", "transforms.json",
+        "viewer.html", "preview.png", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl", "mesh.glb",
+        "points.ply", "colmap", "transforms.json", "splats_constant_colour.ply",
+        "splats.compressed.ply", "splats.spz",
     }  # fmt: skip
     assert {path.name for path in folder.iterdir()} == {
         *description["files"], "scene.json", "README.txt",
@@ -79,7 +84,14 @@ def test_everything_is_there_and_counted(exported: LocalContext, folder: Path) -
     np.testing.assert_allclose(description["frame"]["up"], [1, 0, 0], atol=0.01)
     assert description["counts"]["photographs"] == 4
     assert description["counts"]["placed_photographs"] == 3
-    assert "millimetres" in (folder / "README.txt").read_text()
+    assert description["scale"] == IN_MM.as_dict()
+    turned = description["frame"]["file_from_frame"]
+    metres = np.diag([0.001, 0.001, 0.001, 1]).tolist()
+    assert turned == {"mesh.glb": metres}, "the frame of given cameras is kept"
+    assert " ".join(IN_MM.text.split()) in " ".join((folder / "README.txt").read_text().split())
+    assert (folder / "mesh.stl").read_bytes()[:80].startswith(b"dentalsplat mm +-2.5% (length)")
+    page = (folder / "viewer.html").read_text()
+    assert json.dumps(IN_MM.as_dict(), separators=(",", ":")) in page
     assert exported.figures["splats"] == 1500
     assert exported.figures["mesh_faces"] == description["counts"]["mesh_faces"] > 500
     assert 0.05 < exported.figures["page_mb"] < 1
@@ -186,14 +198,18 @@ def test_both_ways_to_a_mesh(tmp_path: Path) -> None:
     for method in ("tsdf", "poisson"):
         context = export(
             tmp_path / method, mesh_method=method, colmap=False, video=False, viewer=False,
-            preview=False,
+            preview=False, splat_files=False,
         )  # fmt: skip
-        mesh = open3d.io.read_triangle_mesh(str(tmp_path / method / "exports" / "mesh.ply"))
+        file = tmp_path / method / "exports" / "mesh_without_scale.ply"
+        mesh = open3d.io.read_triangle_mesh(str(file))
         error = np.abs(np.linalg.norm(np.asarray(mesh.vertices), axis=1) - 1)
         assert np.median(error) < 0.03
         assert context.figures["mesh_faces"] == len(mesh.triangles)
         names = {path.name for path in (tmp_path / method / "exports").iterdir()}
-        assert names == {"splats.ply", "mesh.ply", "mesh.stl", "scene.json", "README.txt"}
+        assert names == {
+            "splats.ply", "mesh_without_scale.ply", "mesh_without_scale.stl",
+            "mesh_without_scale.glb", "scene.json", "README.txt",
+        }  # fmt: skip
 
 
 def test_the_video_plays_and_shows_the_scene(folder: Path) -> None:
@@ -227,7 +243,8 @@ def test_too_little_for_a_mesh_is_said_and_the_rest_is_made(tmp_path: Path) -> N
     assert len(context.warnings) == 1 and "No mesh" in context.warnings[0]
     assert context.figures["mesh_faces"] == 0
     names = {path.name for path in (tmp_path / "exports").iterdir()}
-    assert "mesh.ply" not in names and {"viewer.html", "preview.png", "splats.ply"} <= names
+    assert not any(name.startswith("mesh") for name in names)
+    assert {"viewer.html", "preview.png", "splats.ply"} <= names
     assert json.loads((tmp_path / "exports" / "scene.json").read_text())["skipped"]
 
 
@@ -242,7 +259,7 @@ def test_points_are_optional_and_views_may_differ_in_size(tmp_path: Path) -> Non
     assert context.figures["mesh_faces"] > 300
     description = json.loads((tmp_path / "exports" / "scene.json").read_text())
     assert description["frame"]["units"] == "arbitrary"
-    assert description["frame"]["name"] == "world"
+    assert description["frame"]["name"] == "upright"
 
 
 def test_without_cameras_it_says_so(tmp_path: Path) -> None:
@@ -250,3 +267,33 @@ def test_without_cameras_it_says_so(tmp_path: Path) -> None:
     case["cameras"] = Cameras(())
     with pytest.raises(ReconstructionError, match="none of the photographs"):
         export(tmp_path, inputs=case)
+
+
+def test_a_mouth_stands_upright_in_every_file(tmp_path: Path) -> None:
+    case = scene.ball_case()
+    mouth = np.diag([1.0, -1, -1, 1])
+    mouth[:3, 3] = [0.1, -0.2, -1]
+    textbook = Scale("mm", "textbook_teeth", 15.0)
+    case["cameras"] = replace(
+        case["cameras"], scale=textbook, mouth_from_world=mouth, input_from_world=SIMILARITY
+    )
+    export(tmp_path, inputs=case, video=False, viewer=False, preview=False)
+    home = tmp_path / "exports"
+    description = json.loads((home / "scene.json").read_text())
+    frame = description["frame"]
+    assert frame["name"] == "mouth"
+    similarity = np.array(frame["frame_from_world"])
+    np.testing.assert_allclose(similarity, np.diag([20.0, 20, 20, 1]) @ mouth)
+    assert description["scale"]["text"] in " ".join((home / "README.txt").read_text().split())
+    ball = scene.ball_gaussians().means @ similarity[:3, :3].T + similarity[:3, 3]
+    turn = np.array(frame["file_from_frame"]["splats.ply"])[:3, :3]
+    found = read_gaussians_ply(home / "splats.ply")["means"]
+    np.testing.assert_allclose(found, ball @ turn.T, atol=1e-3)
+    centre = similarity[:3, 3]
+    for name in ("mesh.ply", "mesh.stl"):
+        turn = np.array(frame["file_from_frame"].get(name, np.eye(4)))[:3, :3]
+        vertices = np.asarray(open3d.io.read_triangle_mesh(str(home / name)).vertices)
+        away = vertices @ turn - centre  # back in the frame
+        assert np.median(np.abs(np.linalg.norm(away, axis=1) - 20)) < 0.6
+        assert away[:, 2].max() > 18, "the front, which was photographed, towards the viewer"
+    assert b"z up" in (home / "mesh.stl").read_bytes()[:80]

@@ -21,17 +21,9 @@ from stages.export.mesh.surface import (
     trusted_depth,
 )
 from stages.export.pictures.orbits import look_at
+from tests.stages import export_scene as scene
 
 VOXEL = 0.04
-
-
-def ball_depth(camera: Camera) -> np.ndarray:
-    """Exact depth of the unit ball, 0 beside it."""
-    direction = camera.unproject(np.ones((camera.height, camera.width))) - camera.centre
-    b = direction @ camera.centre
-    a = (direction**2).sum(-1)
-    root = b**2 - a * (camera.centre @ camera.centre - 1)
-    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
 
 
 def ball_frames():  # type: ignore[no-untyped-def]
@@ -41,7 +33,7 @@ def ball_frames():  # type: ignore[no-untyped-def]
             3 * np.array([np.sin(a), 0.1, -np.cos(a)]), np.zeros(3), np.array([0, -1, 0])
         )
         camera = Camera("", 128, 96, 120.3, 119.0, 64.4, 47.2, pose)
-        depth = ball_depth(camera)
+        depth = scene.ball_depth(camera)
         point = camera.unproject(np.where(depth > 0, depth, 1))
         image = np.clip(127 + 100 * point, 0, 255).astype(np.uint8)
         yield camera, image, trusted_depth(depth, np.ones_like(depth), 10.0)

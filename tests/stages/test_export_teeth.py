@@ -1,5 +1,6 @@
 """`teeth.json`: numbers, doubts, outlines and places of teeth on a ball whose shape is known."""
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,9 @@ import pycolmap
 import pytest
 
 from pipeline.artifacts.cameras import Cameras
-from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.dental.fdi import ALL_TEETH, is_primary, is_upper
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
+from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
@@ -23,57 +26,21 @@ from stages.export.teeth import (
     joint_centre,
     without_names,
 )
+from stages.export.teeth_table import teeth_table, tooth_name
 from tests.stages import export_scene as scene
+from tests.stages.ball_teeth_case import PLACES, cap_outline, teeth_of_ball
 
 #: our world -> the input's millimetres
 SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])
-#: Where the middles of the crowns lie on the ball (unit vectors of the world, -z to the cameras).
-PLACES = {11: (0.1, -0.25, -1.0), 74: (-0.3, 0.3, -1.0)}
-CAP = 0.15  # angle from a crown's middle to its border
 QUIET = {"colmap": False, "mesh": False, "video": False, "viewer": False, "preview": False}
-
-
-def cap_outline(camera, direction, count=24):
-    """[K, 2] pixels of the border of a round crown on the ball."""
-    middle = np.array(direction) / np.linalg.norm(direction)
-    across = np.cross(middle, [0, 1.0, 0])
-    across /= np.linalg.norm(across)
-    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
-    ring = np.cos(angle) * across + np.sin(angle) * np.cross(middle, across)
-    return camera.project(np.cos(CAP) * middle + np.sin(CAP) * ring)[0]
-
-
-def crown_at(camera, number, doubt):
-    outline = cap_outline(camera, PLACES[number])
-    jaw = "upper" if number == 11 else "lower"
-    return Crown(
-        jaw=jaw, zenith=outline[0], tip=outline[12], papilla_left=None, papilla_right=None,
-        embrasure_left=None, embrasure_right=None, width=10.0, height=10.0, outline=outline,
-        number=number, doubt=doubt,
-    )  # fmt: skip
-
-
-def teeth_of_ball():
-    """Three placed photographs, one that could not be placed, and one that is set aside."""
-    doubts = ((0.02, 0.3), (0.1, 0.15), (0.4, 0.5))
-    size = (scene.WIDTH, scene.HEIGHT)
-    views = []
-    for camera, (upper, lower) in zip(scene.ball_cameras(), doubts, strict=True):
-        unsure = replace(crown_at(camera, 11, 1.0), number=0)
-        views.append(
-            Dentition(
-                camera.name, size, "front", (crown_at(camera, 11, upper), unsure),
-                (crown_at(camera, 74, lower),),
-            )
-        )  # fmt: skip
-    lost = replace(views[0], name="003")
-    same = "it shows the same as Smith John 7.jpg, which is clearer"
-    return Teeth((*views, lost, replace(views[0], name="004", set_aside=same)))
+IN_MM = Scale("mm", "tooth_widths", 4.0)
 
 
 def case():
     found = scene.ball_case()
-    found["cameras"] = Cameras(found["cameras"].cameras, input_from_world=SIMILARITY, units="mm")
+    found["cameras"] = Cameras(
+        found["cameras"].cameras, input_from_world=SIMILARITY, scale=IN_MM, given=True
+    )
     aside = View("004", found["views"].views[0].image, source_name="Smith_John_5.jpg")
     found["views"] = Views((*found["views"].views, aside))
     found["teeth"] = teeth_of_ball()
@@ -113,12 +80,65 @@ def test_each_tooth_once_with_its_numbers(written: dict) -> None:
 
 def test_centres_are_where_the_crowns_are(written: dict) -> None:
     assert written["units"] == "mm" and written["frame"] == "input"
+    assert written["scale"] == IN_MM.as_dict()
     for tooth in written["teeth"]:
         direction = np.array(PLACES[tooth["fdi"]])
         truth = SIMILARITY[:3, :3] @ (direction / np.linalg.norm(direction)) + SIMILARITY[:3, 3]
         # the ball has a radius of 20 mm, the crowns are 6 mm wide
         np.testing.assert_allclose(tooth["centre"], truth, atol=0.5)
         assert 0 < tooth["spread"] < 2
+
+
+def test_sizes_are_what_the_photographs_show(written: dict) -> None:
+    """A crown of 2 x 20 mm x sin(.15 rad) = 5.98 mm: foreshortened, so never much larger."""
+    for tooth in written["teeth"]:
+        assert 5.3 < tooth["width"] < 6.3
+        assert 5.3 < tooth["height"] < 6.3
+
+
+def test_no_size_of_a_crown_that_goes_on_unseen(tmp_path: Path) -> None:
+    inputs = case()
+    cut = [
+        replace(view, upper=tuple(replace(crown, cut_left=True) for crown in view.upper))
+        for view in inputs["teeth"].views
+    ]
+    inputs["teeth"] = Teeth(tuple(replace(view, kind="lower") for view in cut))
+    found = json.loads((export(tmp_path, inputs) / "teeth.json").read_text())
+    first, second = found["teeth"]
+    assert (first["width"], first["height"]) == (None, None)
+    assert second["width"] and second["height"] is None, "an occlusal photograph shows no height"
+
+
+def test_a_row_for_each_tooth(folder: Path, written: dict) -> None:
+    rows = list(csv.DictReader((folder / "teeth.csv").open(encoding="utf-8", newline="")))
+    assert [row["name"] for row in rows] == [
+        "upper right central incisor", "lower left primary first molar",
+    ]  # fmt: skip
+    assert [(row["fdi"], row["universal"], row["side"]) for row in rows] == [
+        ("11", "8", "right"), ("74", "L", "left"),
+    ]  # fmt: skip
+    for row, tooth in zip(rows, written["teeth"], strict=True):
+        assert [float(row[axis]) for axis in "xyz"] == tooth["centre"]
+        for name in ("doubt", "spread", "width", "height"):
+            assert float(row[name]) == tooth[name]
+        assert (row["unit"], row["photographs"]) == ("mm", "3")
+
+
+def test_what_is_not_known_is_an_empty_cell() -> None:
+    tooth = {"fdi": 85, "universal": "T", "jaw": "lower", "dentition": "primary", "doubt": 0.5}
+    tooth |= {"centre": None, "spread": None, "width": None, "height": None, "seen_in": [{}]}
+    text = teeth_table({"units": "arbitrary", "teeth": [tooth]})
+    assert text.splitlines()[1] == (
+        "85,T,lower right primary second molar,lower,right,primary,0.5,,,,,,,arbitrary,1"
+    )
+
+
+@pytest.mark.parametrize("number", sorted(ALL_TEETH))
+def test_every_tooth_has_a_name_of_its_own(number: int) -> None:
+    name = tooth_name(number)
+    assert [n for n in ALL_TEETH if tooth_name(n) == name] == [number]
+    assert name.split()[0] == ("upper" if is_upper(number) else "lower")
+    assert ("primary" in name) == is_primary(number)
 
 
 def test_outlines_are_pixels_of_the_images(written: dict) -> None:
@@ -139,6 +159,14 @@ def test_photographs_say_why_they_are_not_used(written: dict, folder: Path) -> N
         assert b"Smith" not in path.read_bytes()
 
 
+def test_what_cannot_be_measured_says_why(written: dict) -> None:
+    assert written["scale"]["unit"] == "mm"
+    said = {entry["name"]: entry["not_visible"] for entry in written["measurements"]}
+    assert said["overjet"] == "no photograph shows 31 or 41 with depth"
+    assert said["intermolar_upper"] == "no photograph shows 16 with depth"
+    assert all(entry["value"] is None for entry in written["measurements"])
+
+
 def test_it_is_described(folder: Path) -> None:
     description = json.loads((folder / "scene.json").read_text())
     assert "teeth.json" in description["files"]
@@ -148,7 +176,8 @@ def test_it_is_described(folder: Path) -> None:
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, folder: Path) -> None:
     again = export(tmp_path, case())
-    assert (again / "teeth.json").read_bytes() == (folder / "teeth.json").read_bytes()
+    for name in ("teeth.json", "teeth.csv"):
+        assert (again / name).read_bytes() == (folder / name).read_bytes()
 
 
 def test_without_teeth_there_is_no_file(tmp_path: Path) -> None:
@@ -170,7 +199,7 @@ def test_a_crown_without_depth_has_no_place() -> None:
         np.eye(4), 1, lambda *_: None,
     )  # fmt: skip
     alone = Teeth((replace(first, upper=(beside,), lower=()),))
-    found = describe_teeth(alone, inputs["views"], made.cameras, made.seen, "world", "arbitrary")
+    found = describe_teeth(alone, inputs["views"], made.cameras, made.seen, "world", NO_SCALE)
     assert found["teeth"][0]["centre"] is None and found["teeth"][0]["spread"] is None
     assert len(found["teeth"][0]["seen_in"]) == 1
 

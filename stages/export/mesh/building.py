@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import to_uint8
+from stages.export.mesh.bend import bent
 from stages.export.mesh.field import TRUNCATION, colors_of, fuse
 from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.surface import (
@@ -70,6 +72,9 @@ def build_mesh(
     trusted: Points = scene.points[scene.points.confidence > confidence]
     if len(trusted) < FEWEST_FACES:
         return None
+    trusted = bent(
+        trusted, scene.cameras, [_trusted(scene, k, np.inf) for k in range(len(scene.seen))]
+    )
     reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * spacing(trusted.positions))
     if method == "tsdf":
         surface = fused(scene, trusted, voxel, cell, between_views, reach_behind, reach, progress)
@@ -113,11 +118,18 @@ def fused(
         seen = scene.seen[index] if index < len(scene.seen) else scene.render(camera)
         eye_to_centre = float(np.linalg.norm(camera.centre - scene.orbit.centre))
         farthest = eye_to_centre + reach_behind * scene.orbit.radius
-        depth = trusted_depth(seen.depth, seen.alpha, farthest)
-        if camera.name in scene.masks:
-            depth = np.where(scene.masks[camera.name], depth, np.float32(0))
+        if index < len(scene.seen):
+            depths.append(_trusted(scene, index, farthest))
+        else:
+            depths.append(trusted_depth(seen.depth, seen.alpha, farthest))
         images.append(to_uint8(seen.image))
-        depths.append(depth)
     field, maps = fuse(cameras, images, depths, voxel, trusted.positions, reach)
     vertices, faces = zero_surface(field.smoothed(), cell)
     return Mesh(vertices, faces, colors_of(vertices, maps, TRUNCATION * voxel))
+
+
+def _trusted(scene: Scene, index: int, farthest: float) -> npt.NDArray[np.float32]:
+    """Depth that the camera of a photograph sees, where the photograph may be used."""
+    seen, mask = scene.seen[index], scene.masks[scene.cameras[index].name]
+    depth = trusted_depth(seen.depth, seen.alpha, farthest)
+    return np.where(mask, depth, np.float32(0))

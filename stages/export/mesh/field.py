@@ -133,6 +133,15 @@ def _touched(points: npt.NDArray[np.floating], edge: float) -> Ints:
     return np.unique(_keys(cubes[(np.abs(cubes) < limit).all(1)].astype(np.int64)))
 
 
+def around_blocks(blocks: Ints) -> Numbers:
+    """[B, 27] rows of the blocks around each of [B, 3] in lexicographic order; -1: none there."""
+    keys = _keys(blocks)
+    around = _keys((blocks[:, None] + _AROUND).reshape(-1, 3))
+    place = np.minimum(np.searchsorted(keys, around), max(len(keys) - 1, 0))
+    there = keys[place] == around if len(keys) else np.zeros(0, bool)
+    return np.where(there, place, -1).reshape(-1, len(_AROUND)).astype(np.int32)
+
+
 def fuse(
     cameras: Sequence[Camera], images: Sequence[Bytes], depths: Sequence[Floats], voxel: float,
     support: npt.NDArray[np.floating], reach: float,
@@ -161,10 +170,7 @@ def fuse(
         near = _grown(near)
     keys = np.intersect1d(keys, near, assume_unique=True)
     blocks = _blocks(keys)
-    around = _keys((blocks[:, None] + _AROUND).reshape(-1, 3))
-    place = np.minimum(np.searchsorted(keys, around), max(len(keys) - 1, 0))
-    there = keys[place] == around if len(keys) else np.zeros(0, bool)
-    neighbours = np.where(there, place, -1).reshape(-1, len(_AROUND)).astype(np.int32)
+    neighbours = around_blocks(blocks)
     maps = DepthMaps.of(cameras, images, depths)
     values = np.zeros((len(blocks), BLOCK, BLOCK, BLOCK), np.float32)
     weights = np.zeros_like(values)

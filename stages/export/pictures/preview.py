@@ -41,8 +41,9 @@ def shade_mesh(mesh: Mesh, camera: Camera) -> Pixels:
     return np.asarray(np.rint(picture * 255), np.uint8)
 
 
-@kernel(nogil=True)
-def draw(points: Array, depths: Array, values: Array, faces: Ints, nearest: Floats, shown: Floats):  # type: ignore[no-untyped-def]
+def draw(
+    points: Array, depths: Array, values: Array, faces: Ints, nearest: Floats, shown: Floats
+) -> None:
     """Draw triangles with a value at each vertex, the nearest before the others.
 
     Args:
@@ -51,6 +52,14 @@ def draw(points: Array, depths: Array, values: Array, faces: Ints, nearest: Floa
         faces: [F, 3].
         nearest: [H, W] 1 / z of what is drawn, 0: nothing. shown: [H, W] the value there.
     """
+    # contiguous, all of them: one kernel instead of one for each mixture
+    given = (np.ascontiguousarray(array) for array in (points, depths, values, faces))
+    _draw(*given, nearest, shown)
+
+
+@kernel(nogil=True)
+def _draw(points, depths, values, faces, nearest, shown):  # type: ignore[no-untyped-def]
+    """See `draw`."""
     height, width = shown.shape
     for face in range(len(faces)):
         i, j, k = faces[face]

@@ -6,7 +6,7 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 
-uniform usampler2D u_splats;      // TEXELS texels a splat, PER_ROW splats a row; see splats.py
+uniform usampler2D u_splats;      // TEXELS texels a splat, PER_ROW splats a row; see decode.js
 uniform mat3 u_rotation;          // cam_from_world
 uniform vec3 u_translation;
 uniform vec3 u_centre;            // projection centre in the world
@@ -16,6 +16,10 @@ uniform vec2 u_size;              // viewport in pixels
 uniform vec2 u_slope_min;         // bounds of x/z and y/z in the Jacobian
 uniform vec2 u_slope_max;
 uniform float u_near;
+uniform usampler2D u_flags;       // bits 0-1: jaw, 2-7: photographs that saw it; see compact.py
+uniform int u_jaw;                // 0: all, 1: upper, 2: lower
+uniform vec4 u_cut;               // what lies beyond this plane is cut away
+uniform bool u_support;           // tint what no photograph, or only one, has seen
 #if LIT
 uniform float u_light[8];         // k, p, m and s of both lobes, distance, gamma: light.py
 uniform float u_exposure;
@@ -117,6 +121,9 @@ void main() {
   vec3 mean = uintBitsToFloat(place.xyz);
   vec3 p = u_rotation * mean + u_translation;
   if (p.z < u_near) return;
+  uint flags = texelFetch(u_flags, ivec2(int(a_splat) % PER_ROW, int(a_splat) / PER_ROW), 0).r;
+  if (u_jaw > 0 && int(flags & 3u) != u_jaw) return;
+  if (dot(u_cut.xyz, mean) > u_cut.w) return;
 
   uvec4 shape = texel(1);
   vec2 log_scale_z_opacity = unpackHalf2x16(shape.y);
@@ -153,4 +160,8 @@ void main() {
   gl_Position = vec4(2.0 * pixel.x / u_size.x - 1.0, 1.0 - 2.0 * pixel.y / u_size.y, 0.0, 1.0);
   vec3 ray = mean - u_centre;
   v_colour = vec4(colour(shape, normalize(ray), length(ray)), opacity);
+  if (u_support && flags < 8u) {
+    vec4 tint = flags < 4u ? vec4(0.90, 0.0, 0.78, 0.65) : vec4(1.0, 0.78, 0.1, 0.35);
+    v_colour.rgb = mix(v_colour.rgb, tint.rgb, tint.a);
+  }
 }

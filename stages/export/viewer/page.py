@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,52 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
+from pipeline.artifacts.space.scale import NO_SCALE
 from stages.export.pictures.orbits import Orbit
-from stages.export.splats import PER_ROW, pack, texels, used_degree, visible, with_material
+from stages.export.splats import PER_ROW, texels, used_degree, visible
+from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
 
 HERE = Path(__file__).parent
-SCRIPTS = ("camera.js", "sort.js", "renderer.js", "viewer.js", "controls.js")
-SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
+SCRIPTS = (
+    "camera.js", "decode.js", "sort.js", "renderer.js", "mesh.js", "picking.js", "measuring.js",
+    "link.js", "viewer.js", "marks.js", "tools.js", "panel.js", "pointers.js", "controls.js",
+    "start.js",
+)  # fmt: skip
+SHADERS = (
+    "splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl",
+    "mesh.vert.glsl", "mesh.frag.glsl",
+)  # fmt: skip
 #: How far beyond the photographs the viewer lets one turn, and the highest elevation (radians).
 BEYOND = np.radians(40.0)
 STEEPEST = np.radians(80.0)
 #: stages/splatting linearises the projection within the view and this share of its size around it
 SLOPE_MARGIN = 0.15
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What the tools of the page need beside the scene.
+
+    Attributes:
+        scale: the record of the scale (`pipeline.artifacts.space.scale.Scale.as_dict`).
+        frame: what the frame of the scene is (`stages.export.texts.describe_frame`).
+        teeth: FDI and Universal number, jaw, doubt, centre [3] and towards [3], the direction from
+            which it was photographed.
+        measurements: see `stages.export.measuring.measures`.
+        axes: [3, 3] rows: the patient's left, up, out of the mouth; None: not known.
+        jaws, seen: [N] of all Gaussians: the jaw (0 neither, 1 upper, 2 lower), and how many
+            photographs saw it; None: not known.
+        mesh: vertices [V, 3], faces [F, 3] and the vertices' jaws [V], small; None: no mesh.
+    """
+
+    scale: Mapping[str, Any] = field(default_factory=NO_SCALE.as_dict)
+    frame: Mapping[str, Any] = field(default_factory=dict)
+    teeth: Sequence[Mapping[str, Any]] = ()
+    measurements: Sequence[Mapping[str, Any]] = ()
+    axes: npt.NDArray[np.float64] | None = None
+    jaws: npt.NDArray[np.uint8] | None = None
+    seen: npt.NDArray[np.uint8] | None = None
+    mesh: tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.uint8]] | None = None
 
 
 def encode_jpeg(image: npt.NDArray[np.uint8], quality: int) -> str:
@@ -108,6 +144,7 @@ def build_page(
     rasterizer: Mapping[str, float],
     sh_degree: int = 3,
     jpeg_quality: int = 85,
+    knowledge: Knowledge | None = None,
 ) -> str:
     """Build the viewer page.
 
@@ -119,40 +156,57 @@ def build_page(
         rasterizer: see `rasterizer_constants`, so that the page draws what the fit has seen.
         sh_degree: highest spherical-harmonics degree to carry.
         jpeg_quality: of the photographs.
+        knowledge: what else is known of the scene, for the tools of the page.
 
     Returns:
         The text of a self-contained HTML file: no names, no paths, no network.
     """
+    known = knowledge or Knowledge()
     shown = visible(gaussians, rasterizer["alpha_min"])
     light = gaussians.light
     kept = Gaussians(
         gaussians.means[shown], gaussians.quats_wxyz[shown], gaussians.log_scales[shown],
         gaussians.logit_opacities[shown], gaussians.sh[shown], light[shown] if light else None,
     )  # fmt: skip
-    degree = min(sh_degree, used_degree(kept))
-    if light:
-        kept, degree = with_material(kept), 1
+    degree = 0 if light else min(sh_degree, used_degree(kept))
+    pack = Pack()
+    none = np.zeros(len(shown), np.uint8)
+    jaws = none if known.jaws is None else known.jaws
+    seen = none if known.seen is None else np.minimum(known.seen, MOST_SEEN)
+    flags = (jaws | seen << 2)[shown]
+    add_gaussians(pack, kept, degree, flags, orbit.centre, orbit.radius)
+    if known.mesh is not None:
+        add_mesh(pack, *known.mesh)
     views = []
     for camera in cameras:
         view = describe_camera(camera)
         if camera.name in photos:
             view["photo"] = encode_jpeg(photos[camera.name], jpeg_quality)
         views.append(view)
+    carried = 1 if light else degree  # the shader takes a light's normals for harmonics
     scene = {
         "format": {
-            "count": len(kept), "sh_degree": degree, "texels": texels(degree), "per_row": PER_ROW,
+            "count": len(kept), "sh_degree": carried, "texels": texels(carried),
+            "per_row": PER_ROW, "arrays": pack.described, "reach": orbit.radius,
             "rasterizer": dict(rasterizer), "light": describe_light(light, orbit),
         },
         "background": list(gaussians.background),
         "orbiting": describe_orbit(orbit),
         "views": views,
         "first": orbit.middle(),
+        "scale": dict(known.scale),
+        "frame": dict(known.frame),
+        "teeth": list(known.teeth),
+        "measurements": list(known.measurements),
+        "axes": None if known.axes is None else known.axes.tolist(),
+        "knows": {"jaws": bool(jaws.any()), "seen": known.seen is not None},
         "shaders": {name: (HERE / name).read_text() for name in SHADERS},
     }  # fmt: skip
     parts = {
+        "styles": (HERE / "viewer.css").read_text(),
         # Nothing in a JSON string can then close the script element.
         "scene": json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),
-        "splats": base64.b64encode(pack(kept, degree).tobytes()).decode("ascii"),
+        "splats": pack.text(),
         "scripts": "\n".join((HERE / name).read_text() for name in SCRIPTS),
     }
     page = (HERE / "viewer.html").read_text()

@@ -1,16 +1,4 @@
-// The page: reads the embedded scene, wires the buttons, keys and fingers to the camera.
-//
-// For tests and for embedding, `window.dentalsplat` offers
-//   ready                  a promise, fulfilled once the first picture has been drawn
-//   views                  the poses of the photographs
-//   setCamera(m, fx, fy, cx, cy, width, height)
-//                          exact camera: m = cam_from_world (12 or 16 numbers, row-major, OpenCV
-//                          axes), and the canvas gets exactly that many pixels
-//   setBackground([r, g, b])   in 0..1
-//   render()               sort and draw now, not at the next frame
-//   pixels()               the drawn picture, RGBA bytes, top row first
-// In the address, `#view=3` opens at the third photograph, `&bare` hides the controls, `&still` turns
-// moving transitions off. Errors are kept in <html data-errors>, progress in <html data-state>.
+// The view of the scene: what the camera sees, in one pane or in two.
 
 const byId = (id) => document.getElementById(id);
 const root = document.documentElement;
@@ -33,30 +21,27 @@ function fail(error) {
 addEventListener("error", (event) => report(event.error ?? event.message));
 addEventListener("unhandledrejection", (event) => report(event.reason));
 
-function unpacked(text) {
-  const bytes = Uint8Array.from(atob(text.trim()), (c) => c.charCodeAt(0));
-  return new Uint32Array(bytes.buffer);
-}
-
 const BACKGROUNDS = [[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]];
 
 class Viewer {
-  constructor(scene, packed) {
+  /** @param {object} scene as the page holds it @param {Splats} splats @param {Store} store */
+  constructor(scene, splats, store) {
     this.scene = scene;
+    this.splats = splats;
+    this.store = store;
     this.canvas = byId("canvas");
     this.camera = new OrbitCamera(scene.orbiting);
-    this.renderer = new SplatRenderer(this.canvas, scene.format, packed, scene.shaders);
-    this.positions = this.#positions(packed);
-    this.sorter = new Sorter(this.positions, (order) => {
-      this.renderer.setOrder(order);
-      this.wake(false);
-    });
+    this.renderer = new SplatRenderer(this.canvas, scene.format, splats, scene.shaders);
+    this.positions = splats.positions;
+    this.sorters = [this.#sorter(0)];
+    this.marks = null;      // what is drawn over the scene
     this.background = 0;
     const own = scene.background;
     this.backgrounds = own.some((value) => value > 0) ? [own, ...BACKGROUNDS] : BACKGROUNDS;
     this.backdrop = this.backgrounds[0];
     this.exact = null;      // a pose set through the hook
     this.view = -1;         // the photograph whose camera this is, or -1
+    this.lens = scene.first;  // the photograph whose lens this is
     this.motion = null;     // a running transition
     this.turning = null;    // the running automatic turn
     this.detail = 1;        // share of the screen's resolution while moving
@@ -65,14 +50,11 @@ class Viewer {
     this.asleep = true;
   }
 
-  #positions(packed) {
-    const stride = 4 * this.scene.format.texels;
-    const floats = new Float32Array(packed.buffer);
-    const positions = new Float32Array(3 * this.scene.format.count);
-    for (let k = 0; k < this.scene.format.count; k++) {
-      positions.set(floats.subarray(k * stride, k * stride + 3), 3 * k);
-    }
-    return positions;
+  #sorter(pane) {
+    return new Sorter(this.positions, (order) => {
+      this.renderer.setOrder(order, pane);
+      this.wake(false);
+    });
   }
 
   /** Draw at the next frame; `moving` if the camera changed and so does the depth order. */
@@ -89,15 +71,17 @@ class Viewer {
     this.lastFrame = now;
     const moving = this.#advance(now) || this.held;
     this.#adapt(moving, elapsed);
-    const pose = this.#currentPose();
+    const panes = this.panes();
     if (this.moved) {
       this.moved = false;
-      this.sorter.request(depthAxis(pose));
+      panes.forEach((pane, index) => {
+        this.sorters[index] ??= this.#sorter(index);
+        this.sorters[index].request(depthAxis(pane.pose));
+      });
       this.settle && clearTimeout(this.settle);
       this.settle = setTimeout(() => { this.detail < 1 && this.wake(false); }, 250);
     }
-    this.renderer.draw(pose, this.backdrop);
-    this.#layPhoto(pose);
+    this.#draw(panes);
     if (this.motion || this.turning) this.wake(true);
   }
 
@@ -133,24 +117,97 @@ class Viewer {
     return false;
   }
 
-  #currentPose() {
+  #draw(panes) {
+    const shown = this.shownParts();
+    panes.forEach(({ pose, left }, index) => {
+      this.renderer.draw(pose, this.backdrop, shown, index, left);
+    });
+    this.#layPhoto(panes[0].pose);
+    this.marks?.draw(panes);
+  }
+
+  /** What of the scene is drawn: jaw, section plane and overlays as the shaders take them. */
+  shownParts() {
+    const { jaw, support, mesh } = this.store.now;
+    return { jaw: CHOICES.jaw.indexOf(jaw), cut: this.#cut(), support, mesh };
+  }
+
+  /** The section plane [4]: what has n . x > d is cut away. */
+  #cut() {
+    const { axis, at } = this.store.now;
+    const number = { across: 0, height: 1, depth: 2 }[axis];
+    if (number === undefined) return [0, 0, 0, 1];
+    const normal = this.axes()[number];
+    const { centre, radius } = this.scene.orbiting;
+    return [...normal, dot(normal, centre) + at * radius];
+  }
+
+  /** The patient's left, up and out of the mouth; without teeth those of the photographs. */
+  axes() {
+    const { up, front } = this.scene.orbiting;
+    return this.scene.axes ?? [cross(up, front), up, front];
+  }
+
+  /**
+   * What is drawn where, in pixels of the canvas.
+   * @returns {{pose: Pose, left: number}[]}
+   */
+  panes() {
     if (this.exact) {
       this.canvas.width = this.exact.width;
       this.canvas.height = this.exact.height;
-      return this.exact;
+      return [{ pose: this.exact, left: 0 }];
     }
     const ratio = Math.min(devicePixelRatio || 1, 2) * (this.shown ?? 1);
-    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
+    const width = Math.max(2, Math.round(this.canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    const strip = Math.min(byId("bar").offsetHeight / this.canvas.clientHeight, 0.35);
-    return this.camera.fitted(width, height, strip * height);
+    const { below, beside } = this.#covered();
+    const [strip, side] = [below * height, Math.round(beside * width)];
+    if (!this.store.now.sides) {
+      return [{ pose: this.camera.fitted(width, height, strip, side), left: 0 }];
+    }
+    const half = Math.floor((width - side) / 2);
+    const pose = this.camera.fitted(half, height, strip);
+    const other = mirrored(pose, this.scene.orbiting.centre, unit(this.axes()[0]));
+    return [{ pose, left: 0 }, { pose: other, left: half }];
+  }
+
+  /** Shares of the canvas that the controls cover: at the bottom, and at the right. */
+  #covered() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const tools = byId("tools");
+    const sheet = tools.offsetWidth > 0.8 * width;  // on phones it lies below
+    return {
+      below: Math.min(Math.max(byId("bar").offsetHeight, sheet ? tools.offsetHeight : 0) / height,
+        0.5),
+      beside: sheet || byId("bar").hidden ? 0 : Math.min(tools.offsetWidth / width, 0.4),
+    };
+  }
+
+  /** The pane and its pixel under a place on the page. */
+  paneAt(x, y) {
+    const panes = this.panes();
+    const box = this.canvas.getBoundingClientRect();
+    const scale = this.canvas.width / box.width;
+    const pixel = [(x - box.left) * scale, (y - box.top) * scale];
+    const { pose, left } = panes[panes.length > 1 && pixel[0] >= panes[1].left ? 1 : 0];
+    return { pose, x: pixel[0] - left, y: pixel[1] };
+  }
+
+  /** The middle of the free part of the first pane, in pixels of the page. */
+  crosshair() {
+    const { pose } = this.panes()[0];
+    const scale = this.canvas.clientWidth / this.canvas.width;
+    const { left = 0, top = 0, width = pose.width, height = pose.height } = pose.frame ?? {};
+    return [(left + width / 2) * scale, (top + height / 2) * scale];
   }
 
   #layPhoto(pose) {
     const photo = byId("photo");
-    const share = this.view >= 0 && !this.motion ? Number(byId("opacity").value) / 100 : 0;
+    const alone = this.view >= 0 && !this.motion && !this.store.now.sides;
+    const share = alone ? Number(byId("opacity").value) / 100 : 0;
     photo.style.opacity = share;
     if (!pose.frame || share === 0) return;
     const scale = this.canvas.clientWidth / pose.width;
@@ -163,10 +220,11 @@ class Viewer {
   render() {
     this.#advance(performance.now());
     this.shown = 1;
-    const pose = this.#currentPose();
-    this.renderer.setOrder(backToFront(this.positions, depthAxis(pose)));
-    this.renderer.draw(pose, this.backdrop);
-    this.#layPhoto(pose);
+    const panes = this.panes();
+    panes.forEach(({ pose }, index) => {
+      this.renderer.setOrder(backToFront(this.positions, depthAxis(pose)), index);
+    });
+    this.#draw(panes);
   }
 
   /** The user moved the camera: it is no longer that of a photograph. */
@@ -190,7 +248,7 @@ class Viewer {
     this.camera.place(pose);
     const to = this.camera.snapshot();
     const arrive = () => this.camera.place(pose);  // free of rounding
-    this.view = index;
+    this.view = this.lens = index;
     if (pose.photo) byId("photo").src = pose.photo;
     this.#announce();
     if (still || this.still || matchMedia("(prefers-reduced-motion: reduce)").matches) {
@@ -208,6 +266,17 @@ class Viewer {
       button.setAttribute("aria-pressed", index === this.view);
       if (index === this.view) button.scrollIntoView?.({ block: "nearest", inline: "nearest" });
     }
+  }
+
+  /** Stand where a link says. */
+  stand({ rotation, target, distance, lens }) {
+    this.goTo(lens, { still: true });
+    Object.assign(this.camera, { rotation, target, distance });
+    const home = this.scene.views[lens];
+    const pose = this.camera.pose();
+    const off = Math.hypot(...minus(pose.translation, home.translation))
+      + Math.hypot(...pose.rotation.map((value, k) => value - home.rotation[k]));
+    if (off > 1e-3 * this.scene.orbiting.radius) this.leave();
   }
 
   nearestView() {

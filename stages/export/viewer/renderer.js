@@ -17,15 +17,15 @@ class SplatRenderer {
    * @param {HTMLCanvasElement} canvas
    * @param {{count: number, sh_degree: number, texels: number, per_row: number,
    *   rasterizer: object, light: ?object}} format of the packed splats
-   * @param {Uint32Array} packed
+   * @param {Splats} splats
    * @param {Record<string, string>} shaders GLSL by file name
    */
-  constructor(canvas, format, packed, shaders) {
+  constructor(canvas, format, splats, shaders) {
     this.canvas = canvas;
     this.format = format;
-    this.packed = packed;
+    this.contents = splats;
     this.shaders = shaders;
-    this.order = null;
+    this.orders = [null, null];  // of both panes
     this.#build();
   }
 
@@ -40,24 +40,35 @@ class SplatRenderer {
       ?? gl.getExtension("EXT_color_buffer_half_float"));
     const { texels, per_row: perRow, sh_degree: degree, rasterizer: r } = this.format;
     const defines = {
-      TEXELS: texels, PER_ROW: perRow, SH_DEGREE: degree, LIT: this.format.light ? 1 : 0, LOW_PASS: r.low_pass.toFixed(6),
+      TEXELS: texels, PER_ROW: perRow, SH_DEGREE: degree, LIT: this.format.light ? 1 : 0,
+      LOW_PASS: r.low_pass.toFixed(6),
       ALPHA_MIN: r.alpha_min.toFixed(9), ALPHA_MAX: r.alpha_max.toFixed(6),
     };
     this.splatProgram = this.#program("splat.vert.glsl", "splat.frag.glsl", defines);
     this.screenProgram = this.#program("screen.vert.glsl", "screen.frag.glsl", {});
     this.#upload();
-    this.orderBuffer = gl.createBuffer();
-    this.vertices = gl.createVertexArray();
-    gl.bindVertexArray(this.vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    this.panes = [0, 1].map(() => this.#pane());
+    this.noVertices = gl.createVertexArray();
+    this.target = null;
+    const { mesh } = this.contents;
+    this.mesh = mesh
+      && new MeshLayer(gl, this.#program("mesh.vert.glsl", "mesh.frag.glsl", {}), mesh);
+    this.orders.forEach((order, pane) => order && this.setOrder(order, pane));
+  }
+
+  /** The order of the splats in one pane, as the vertex shader reads it. */
+  #pane() {
+    const gl = this.gl;
+    const buffer = gl.createBuffer();
+    const vertices = gl.createVertexArray();
+    gl.bindVertexArray(vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     const slot = gl.getAttribLocation(this.splatProgram.handle, "a_splat");
     gl.enableVertexAttribArray(slot);
     gl.vertexAttribIPointer(slot, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(slot, 1);
     gl.bindVertexArray(null);
-    this.noVertices = gl.createVertexArray();
-    this.target = null;
-    if (this.order) this.setOrder(this.order);
+    return { buffer, vertices };
   }
 
   /** After a lost context: everything on the graphics card has to be made again. */
@@ -100,13 +111,24 @@ class SplatRenderer {
       throw new Error(`The scene is too large for this device (${count} Gaussians).`);
     }
     const padded = new Uint32Array(width * height * 4);
-    padded.set(this.packed);
-    this.splats = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, this.splats);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    padded.set(this.contents.packed);
+    this.splats = this.#texture();
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, width, height, 0, gl.RGBA_INTEGER,
       gl.UNSIGNED_INT, padded);
+    const flags = new Uint8Array(perRow * height);
+    flags.set(this.contents.flags);
+    this.flags = this.#texture();
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8UI, perRow, height, 0, gl.RED_INTEGER, gl.UNSIGNED_BYTE,
+      flags);
+  }
+
+  #texture() {
+    const gl = this.gl;
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    return texture;
   }
 
   #resizeTarget(width, height) {
@@ -116,11 +138,8 @@ class SplatRenderer {
       gl.deleteTexture(this.target.texture);
       gl.deleteFramebuffer(this.target.framebuffer);
     }
-    const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
+    const texture = this.#texture();
     gl.texStorage2D(gl.TEXTURE_2D, 1, this.halfFloat ? gl.RGBA16F : gl.RGBA8, width, height);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     const framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
@@ -134,11 +153,11 @@ class SplatRenderer {
     this.target = { texture, framebuffer, width, height };
   }
 
-  /** @param {Uint32Array} order splat indices, farthest first */
-  setOrder(order) {
+  /** @param {Uint32Array} order splat indices, farthest first @param {number} pane 0 or 1 */
+  setOrder(order, pane = 0) {
     const gl = this.gl;
-    this.order = order;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    this.orders[pane] = order;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.panes[pane].buffer);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
   }
 
@@ -150,26 +169,56 @@ class SplatRenderer {
   }
 
   /**
-   * Draw into the canvas, whose size in pixels is that of the pose.
+   * Draw a pane of the canvas: as many pixels as the pose has, from the pixel `left` on.
    * @param {Pose} pose @param {number[]} background rgb in 0..1
+   * @param {{jaw: number, cut: number[], support: boolean, mesh: boolean}} shown
    */
-  draw(pose, background) {
+  draw(pose, background, shown, pane = 0, left = 0) {
     const gl = this.gl;
-    if (gl.isContextLost() || !this.order) return;
-    const { width, height, fx, fy, cx, cy, rotation: R, translation: t } = pose;
+    if (gl.isContextLost() || !this.orders[pane]) return;
+    const { width, height } = pose;
     this.#resizeTarget(width, height);
-    gl.viewport(0, 0, width, height);
+    const mesh = shown.mesh && this.mesh
+      ? this.mesh.draw(pose, this.format.rasterizer.near, shown) : null;
+    this.#drawSplats(pose, shown, pane);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(left, 0, width, height);
+    gl.disable(gl.BLEND);
+    gl.useProgram(this.screenProgram.handle);
+    const u = this.screenProgram.uniforms;
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, mesh ?? this.target.texture);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
+    gl.uniform1i(u.u_mesh, 1);
+    gl.uniform1f(u.u_mesh_share, mesh ? 0.8 : 0);
+    gl.uniform2i(u.u_offset, left, 0);
+    gl.bindVertexArray(this.noVertices);
+    gl.uniform3fv(u.u_background, background);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
 
+  #drawSplats(pose, shown, pane) {
+    const gl = this.gl;
+    const { width, height, fx, fy, cx, cy, rotation: R, translation: t } = pose;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
+    gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(this.splatProgram.handle);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, this.flags);
+    gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.splats);
-    gl.bindVertexArray(this.vertices);
+    gl.bindVertexArray(this.panes[pane].vertices);
     const u = this.splatProgram.uniforms;
     const { near, slope_margin: margin } = this.format.rasterizer;
+    gl.uniform1i(u.u_flags, 1);
+    gl.uniform1i(u.u_jaw, shown.jaw);
+    gl.uniform4fv(u.u_cut, shown.cut);
+    gl.uniform1i(u.u_support, shown.support ? 1 : 0);
     gl.uniformMatrix3fv(u.u_rotation, true, R);
     gl.uniform3fv(u.u_translation, t);
     gl.uniform3fv(u.u_centre, centreOf(R, t));
@@ -184,14 +233,6 @@ class SplatRenderer {
       gl.uniform1fv(u["u_light[0]"] ?? u.u_light, this.format.light.globals);
       gl.uniform1f(u.u_exposure, this.#exposure(centreOf(R, t)));
     }
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.order.length);
-
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.disable(gl.BLEND);
-    gl.useProgram(this.screenProgram.handle);
-    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
-    gl.bindVertexArray(this.noVertices);
-    gl.uniform3fv(this.screenProgram.uniforms.u_background, background);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.orders[pane].length);
   }
 }

@@ -48,6 +48,18 @@ function orthonormal(R) {
   return [...x, ...cross(z, x), ...z];
 }
 
+/** The pose that shows the mirror image's place: reflected in a plane through `point`. */
+function mirrored(pose, point, normal) {
+  const over = (vector) => minus(vector, scaled(normal, 2 * dot(vector, normal)));
+  const { rotation: R, translation: t } = pose;
+  const eye = plus(point, over(minus(centreOf(R, t), point)));
+  const rotation = [
+    ...scaled(over(R.slice(0, 3)), -1), ...over(R.slice(3, 6)), ...over(R.slice(6, 9))];
+  return {
+    ...pose, rotation, translation: scaled(applied(rotation, eye), -1), cx: pose.width - pose.cx,
+  };
+}
+
 /**
  * A camera that looks at a target on its optical axis, and moves about it within limits.
  *
@@ -142,13 +154,13 @@ class OrbitCamera {
   }
 
   /**
-   * The same camera for a canvas: the photograph's frame fits inside, centred above a strip at the
-   * bottom that the controls cover.
+   * The same camera for a canvas: the photograph's frame fits inside, centred in what is left by a
+   * strip at the bottom and one at the right that the controls cover.
    */
-  fitted(width, height, strip = 0) {
+  fitted(width, height, strip = 0, side = 0) {
     const pose = this.pose();
-    const scale = Math.min(width / pose.width, (height - strip) / pose.height);
-    const left = (width - pose.width * scale) / 2;
+    const scale = Math.min((width - side) / pose.width, (height - strip) / pose.height);
+    const left = (width - side - pose.width * scale) / 2;
     const top = (height - strip - pose.height * scale) / 2;
     return {
       ...pose, width, height, fx: pose.fx * scale, fy: pose.fy * scale,

@@ -1,0 +1,126 @@
+"""Which part of a mesh belongs to which jaw, by the crowns in the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
+from pipeline.artifacts.teeth import Dentition, filled
+from stages.export.mesh.surface import Mesh
+from stages.export.mesh.texture.charts import charts, neighbours
+from stages.export.mesh.texture.sight import Sight
+
+Bools = npt.NDArray[np.bool_]
+Signs = npt.NDArray[np.int8]
+
+#: A jaw is known if its crowns are seen at this many vertices, and has this many faces.
+FEWEST_VERTICES, FEWEST_FACES = 30, 100
+#: Pixels by which crowns are taken smaller: their outlines are no better.
+BORDER = 1
+#: How often the border between the jaws is evened out.
+EVENINGS = 6
+#: A piece smaller than this share of its jaw's largest that touches the other jaw belongs to that.
+SMALLEST_PIECE = 0.02
+
+
+def crown_maps(
+    dentitions: Mapping[str, Dentition], cameras: Sequence[Camera]
+) -> list[Signs | None]:
+    """Where each camera sees crowns: [H, W], 1 the upper jaw's, -1 the lower jaw's, 0 none.
+
+    Args:
+        dentitions: by camera name, in pixels of the exported images; one without a name shows none
+            (see `stages.export.measuring.mouth.Mouth`).
+        cameras: K of them.
+    """
+    kernel = np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)
+    maps: list[Signs | None] = []
+    for camera in cameras:
+        dentition = dentitions.get(camera.name)
+        if dentition is None or not dentition.all_crowns:
+            maps.append(None)
+            continue
+        found = np.zeros((camera.height, camera.width), np.int8)
+        for jaw, sign in zip(JAWS, (1, -1), strict=True):
+            mask = filled(dentition.crowns(jaw), (camera.width, camera.height)).astype(np.uint8)
+            found += np.int8(sign) * cv2.erode(mask, kernel).astype(np.int8)
+        maps.append(found)
+    return maps
+
+
+def jaws_of(mesh: Mesh, seen: Sequence[Sight], maps: Sequence[Signs | None]) -> Mapping[Jaw, Bools]:
+    """The faces of each jaw.
+
+    The photographs vote on the vertices that they show inside crowns. Gums and all else go with the
+    crown that is nearest along the surface.
+
+    Args:
+        mesh: to divide.
+        seen: as each of K cameras sees it.
+        maps: K times where crowns are, see `crown_maps`.
+
+    Returns:
+        Jaw -> [F] bool, both jaws; nothing, if the crowns of a jaw are hardly seen.
+    """
+    votes = np.zeros(len(mesh.vertices), np.int64)
+    for sight, crowns in zip(seen, maps, strict=True):
+        if crowns is not None:
+            column, row = sight.pixels[sight.seen].astype(np.int64).T
+            votes[sight.seen] += crowns[row, column]
+    if min((votes > 0).sum(), (votes < 0).sum()) < FEWEST_VERTICES:
+        return {}
+    graph = _edges(mesh)
+    sign = _carried_on(mesh, graph, np.sign(votes))
+    shares = 1 / (1 + np.diff(graph.indptr))
+    ties = graph.copy()
+    ties.data[:] = 1
+    for _ in range(EVENINGS):
+        sign = (sign + ties @ sign) * shares
+    upper = sign[mesh.faces].sum(1) > 0
+    pairs = neighbours(mesh.faces)
+    piece = charts(upper.astype(np.int64), pairs)
+    sizes = np.bincount(piece)
+    largest = {side: sizes[piece[upper == side]].max(initial=0) for side in (True, False)}
+    border = upper[pairs[:, 0]] != upper[pairs[:, 1]]
+    touching = np.zeros(len(sizes), bool)
+    touching[piece[pairs[border].ravel()]] = True
+    small = sizes[piece] < SMALLEST_PIECE * np.where(upper, largest[True], largest[False])
+    upper = upper ^ (small & touching[piece])
+    if min(upper.sum(), (~upper).sum()) < FEWEST_FACES:
+        return {}
+    return {"upper": upper, "lower": ~upper}
+
+
+def _edges(mesh: Mesh) -> csr_matrix:
+    """[V, V] symmetric: the lengths of the edges."""
+    start = mesh.faces[:, [0, 1, 2, 1, 2, 0]].ravel().astype(np.int64)
+    end = mesh.faces[:, [1, 2, 0, 0, 1, 2]].ravel().astype(np.int64)
+    count = len(mesh.vertices)
+    once = np.unique(start * count + end)
+    start, end = once // count, once % count
+    lengths = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
+    lengths = np.maximum(lengths, 1e-12)  # 0 would be no edge
+    return coo_matrix((lengths, (start, end)), (count, count)).tocsr()
+
+
+def _carried_on(
+    mesh: Mesh, graph: csr_matrix, sign: npt.NDArray[np.integer]
+) -> npt.NDArray[np.float64]:
+    """[V] +-1: that of the nearest vertex that has one, along the edges if they lead to one."""
+    known = np.flatnonzero(sign)
+    _, _, source = dijkstra(graph, indices=known, min_only=True, return_predecessors=True)
+    reached = source >= 0
+    result = np.zeros(len(sign))
+    result[reached] = sign[source[reached]]
+    if not reached.all():
+        near = cKDTree(mesh.vertices[known]).query(mesh.vertices[~reached])[1]
+        result[~reached] = sign[known[near]]
+    return result

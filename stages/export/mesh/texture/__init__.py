@@ -1,0 +1,1 @@
+"""Which photograph colours which part of a mesh, and both in one file."""

@@ -1,0 +1,48 @@
+"""How each exported file stands, so that it opens the right way up and from the front.
+
+The exports share one frame: x right, y up, z towards the viewer. Files whose readers take another
+direction for up are turned:
+
+- 3DGS `.ply` and compressed `.ply`: SuperSplat and PlayCanvas turn them by 180 degrees about z when
+  they load them (`Transform.PLY` of @playcanvas/splat-transform), for scenes of 3DGS have y down.
+- `.stl`: slicers and CAD have z up and look along y.
+
+Lengths in `.glb` are metres, as glTF wants it, where a millimetre is known.
+
+`.spz` declares x right, y up, z back, and MeshLab (`.ply` meshes) and glTF have y up and look along
+-z: as it is. nerfstudio turns scenes upright itself, by the cameras.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.space.frames import VIEWERS_PLY
+
+Array = npt.NDArray[np.float64]
+
+#: y up -> z up, the front towards -y.
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+#: Millimetres -> metres.
+METRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+
+
+def file_from_frame(name: str, stands: bool, millimetres: bool = False) -> Array:
+    """[4, 4] rotation (of `.glb`: scale) from the frame of the exports to that of a file.
+
+    Args:
+        name: of the file.
+        stands: the frame has y up and z towards the viewer. Where it has not (that of given
+            cameras, our own world), all files are in it as it is.
+        millimetres: that is the unit of the frame.
+    """
+    if millimetres and name.endswith(".glb"):
+        return METRES
+    if stands and name.startswith("splats") and name.endswith(".ply"):
+        return VIEWERS_PLY
+    if stands and name.endswith(".stl"):
+        return Z_UP
+    return np.eye(4)

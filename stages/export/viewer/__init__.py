@@ -1,0 +1,1 @@
+"""The viewer page: one HTML file, and how the scene gets into it."""

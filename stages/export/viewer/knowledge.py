@@ -1,0 +1,150 @@
+"""What the viewer knows of each place beside its colour: the jaw, and who saw it; and the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.teeth import Dentition, filled
+from stages.splatting.rendering import RenderedView
+from stages.splatting.support import SeenSurface, seen_surface, supporting_views
+
+Array = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.floating]
+
+#: As in `evaluate`: a relative difference of depth within which it is the same surface.
+SAME_SURFACE = 0.02
+#: Less opaque than this a pixel shows nothing.
+LEAST_ALPHA = 0.5
+NEITHER, UPPER, LOWER = 0, 1, 2
+#: A jaw reaches this many crowns' heights beyond the outlines: its gum, without lips and cheeks.
+GUM = 1.3
+#: Vertices of the mesh that lies over the scene, about.
+OVERLAY_VERTICES = 7000
+
+
+def seen_surfaces(
+    cameras: Sequence[Camera],
+    seen: Sequence[RenderedView],
+    usable: Mapping[str, npt.NDArray[np.bool_]],
+) -> list[SeenSurface]:
+    """What the photographs show of the scene: rendered depth where it may be used."""
+    return [
+        seen_surface(
+            camera, view.depth, view.alpha >= LEAST_ALPHA,
+            usable.get(camera.name, np.ones(view.alpha.shape, np.bool_)),
+        )
+        for camera, view in zip(cameras, seen, strict=True)
+    ]  # fmt: skip
+
+
+def photographs_that_saw(points: Floats, surfaces: Sequence[SeenSurface]) -> Bytes:
+    """[N] how many photographs saw each point [N, 3], at most 255."""
+    counts = supporting_views(np.asarray(points, np.float64), surfaces, SAME_SURFACE)
+    return np.minimum(counts, 255).astype(np.uint8)
+
+
+def jaw_map(dentition: Dentition) -> Bytes:
+    """[H, W] which jaw the nearest crown is of; `NEITHER` where it is far from all crowns."""
+    width, height = dentition.size
+    distances = []
+    for jaw in ("upper", "lower"):
+        crowns = dentition.crowns(jaw)
+        away = (~filled(crowns, dentition.size)).astype(np.uint8)
+        distances.append(
+            cv2.distanceTransform(away, cv2.DIST_L2, 5)
+            if crowns
+            else np.full((height, width), np.inf, np.float32)
+        )
+    tall = [np.linalg.norm(crown.zenith - crown.tip) for crown in dentition.all_crowns]
+    reach = GUM * float(np.median(tall)) if tall else 0.0
+    nearest = np.where(distances[0] <= distances[1], UPPER, LOWER)
+    return np.where(np.minimum(*distances) <= reach, nearest, NEITHER).astype(np.uint8)
+
+
+def jaws_of(
+    points: Floats, surfaces: Sequence[SeenSurface], dentitions: Mapping[str, Dentition]
+) -> Bytes:
+    """[N] the jaw of each point [N, 3]: what most photographs that see it say.
+
+    What no photograph sees is of the jaw of the nearest point that one sees.
+    """
+    votes = np.zeros((len(points), 3), np.int64)
+    for surface in surfaces:
+        dentition = dentitions.get(surface.camera.name)
+        if dentition is None or not dentition.all_crowns:
+            continue
+        jaws = jaw_map(dentition)
+        pixels, depth = surface.camera.project(points)
+        column, row = np.floor(pixels).astype(np.int64).T
+        inside = (depth > 0) & (column >= 0) & (column < jaws.shape[1])
+        inside &= (row >= 0) & (row < jaws.shape[0])
+        index = np.flatnonzero(inside)
+        there = surface.depth[row[index], column[index]]
+        shown = (there > 0) & (np.abs(there - depth[index]) < 1.5 * SAME_SURFACE * depth[index])
+        index = index[shown]
+        votes[index, jaws[row[index], column[index]]] += 1
+    found = votes.argmax(1).astype(np.uint8)
+    told = votes.any(1)
+    if told.any() and not told.all():
+        _, nearest = cKDTree(points[told]).query(points[~told])
+        found[~told] = found[told][nearest]
+    return found if told.any() else np.zeros(len(points), np.uint8)
+
+
+def coarse(
+    vertices: Floats, faces: npt.NDArray[np.integer], count: int = OVERLAY_VERTICES
+) -> tuple[Array, npt.NDArray[np.int64]]:
+    """A mesh with about `count` vertices: those in a cell of a grid become one, their mean.
+
+    (Vertex clustering, Rossignac & Borrel 1993: not the best triangles, but at once.)
+    """
+    if len(vertices) <= count:
+        return np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    # A surface crosses about 1.5 cells for each square of a cell's edge.
+    cell = np.sqrt(1.5 * area / count)
+    keys = np.floor((vertices - vertices.min(0)) / cell).astype(np.int64)
+    size = keys.max(0) + 1
+    flat = (keys[:, 0] * size[1] + keys[:, 1]) * size[2] + keys[:, 2]
+    _, member, number = np.unique(flat, return_inverse=True, return_counts=True)
+    sums = [np.bincount(member, vertices[:, axis], len(number)) for axis in range(3)]
+    merged = np.stack(sums, 1) / number[:, None]
+    corners = member[faces]
+    whole = (corners != np.roll(corners, 1, axis=1)).all(1)
+    corners = corners[whole]
+    _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+    return merged, corners[np.sort(first)].astype(np.int64)
+
+
+def directions(
+    teeth: Sequence[Mapping[str, Any]], cameras: Sequence[Camera]
+) -> list[dict[str, Any]]:
+    """The teeth that have a place, as the page takes them, and from where they were photographed.
+
+    Args:
+        teeth: entries of `teeth.json`.
+        cameras: of the placed photographs.
+    """
+    eyes = {camera.name: camera.centre for camera in cameras}
+    found = []
+    for tooth in teeth:
+        if tooth["centre"] is None:
+            continue
+        centre = np.array(tooth["centre"])
+        rays = [eyes[s["photograph"]] - centre for s in tooth["seen_in"] if s["photograph"] in eyes]
+        towards = np.sum([ray / np.linalg.norm(ray) for ray in rays], axis=0)
+        towards = towards / max(float(np.linalg.norm(towards)), 1e-12)
+        found.append(
+            {key: tooth[key] for key in ("fdi", "universal", "jaw", "doubt", "centre")}
+            | {"towards": np.round(towards, 4).tolist()}
+        )
+    return found

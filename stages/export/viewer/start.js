@@ -1,0 +1,105 @@
+// The page: unpacks the embedded scene and puts everything together.
+//
+// For tests and for embedding, `window.dentalsplat` offers
+//   ready                  a promise, fulfilled once the first picture has been drawn
+// and from then on
+//   views                  the poses of the photographs
+//   state                  what the page shows (see link.js)
+//   setCamera(m, fx, fy, cx, cy, width, height)
+//                          exact camera: m = cam_from_world (12 or 16 numbers, row-major, OpenCV
+//                          axes), and the canvas gets exactly that many pixels
+//   setBackground([r, g, b])   in 0..1
+//   pick(x, y)             the place of the surface under a pixel of the canvas, or null
+//   render()               sort and draw now, not at the next frame
+//   pixels()               the drawn picture, RGBA bytes, top row first
+// In the address, `#view=3` opens at the third photograph, `&bare` hides the controls, `&still` turns
+// moving transitions off; what else a link holds is in link.js. Errors are kept in
+// <html data-errors>, progress in <html data-state>.
+
+/** Follow the address. */
+function readAddress(viewer, tools) {
+  const { hash } = location;
+  const wanted = new URLSearchParams(hash.slice(1));
+  viewer.still = wanted.has("still");
+  byId("bar").hidden = byId("label").hidden = wanted.has("bare");
+  const { views, orbiting } = viewer.scene;
+  const { state, camera } = readLink(hash, orbiting, views.length);
+  if (Object.keys(state).length) tools.show(tools.possible(state));
+  if (camera) {
+    viewer.stand(camera);
+    return true;
+  }
+  const number = Number(wanted.get("view"));
+  if (!Number.isInteger(number) || number < 1 || number > views.length) return false;
+  viewer.goTo(number - 1, { still: root.dataset.state !== "ready" });
+  return true;
+}
+
+function hookOf(viewer) {
+  return {
+    get state() { return viewer.store.now; },
+    views: viewer.scene.views.map(({ photo, ...pose }) => pose),
+    setCamera(matrix, fx, fy, cx, cy, width, height) {
+      const row = (k) => matrix.slice(4 * k, 4 * k + 3);
+      viewer.stopTurning();
+      viewer.leave();
+      viewer.exact = {
+        rotation: [...row(0), ...row(1), ...row(2)], translation: [3, 7, 11].map((k) => matrix[k]),
+        fx, fy, cx, cy, width, height,
+      };
+      viewer.wake();
+    },
+    setBackground(rgb) {
+      viewer.backdrop = rgb;
+      viewer.wake(false);
+    },
+    pick: (x, y) => pick(
+      viewer.splats, viewer.scene.format, viewer.panes()[0].pose, x, y, viewer.shownParts()),
+    render: () => viewer.render(),
+    pixels() {
+      viewer.render();
+      const { gl, canvas } = viewer.renderer;
+      const row = 4 * canvas.width;
+      const upward = new Uint8Array(row * canvas.height);
+      gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, upward);
+      const downward = new Uint8Array(upward.length);
+      for (let y = 0; y < canvas.height; y++) {
+        downward.set(upward.subarray(y * row, (y + 1) * row), (canvas.height - 1 - y) * row);
+      }
+      return downward;
+    },
+  };
+}
+
+async function start() {
+  const scene = JSON.parse(byId("scene").textContent);
+  scene.format.knowsSeen = scene.knows.seen;
+  const text = byId("splats").textContent;
+  byId("splats").remove();  // a megabyte and more
+  const splats = await unpacked(text, scene.format, scene.orbiting.centre);
+  const viewer = new Viewer(scene, splats, new Store());
+  const tools = new Tools(viewer);
+  viewer.marks = new Marks(viewer);
+  addPanel(viewer, tools);
+  addViewButtons(viewer);
+  addButtons(viewer);
+  addKeys(viewer, tools);
+  addPointers(viewer, tools);
+  viewer.goTo(scene.first, { still: true });
+  readAddress(viewer, tools);
+  viewer.render();
+  Object.defineProperties(
+    window.dentalsplat, Object.getOwnPropertyDescriptors(hookOf(viewer)));
+  root.dataset.state = "ready";
+
+  addEventListener("resize", () => viewer.wake(false));
+  addEventListener("hashchange", () => readAddress(viewer, tools));
+  viewer.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+  viewer.canvas.addEventListener("webglcontextrestored", () => {
+    viewer.renderer.restore();
+    viewer.wake();
+  });
+}
+
+window.dentalsplat = {};
+window.dentalsplat.ready = start().catch(fail);

@@ -1,0 +1,284 @@
+"""Meshes with photographs on them, jaw by jaw, closed for printing, bent as the fit bent them."""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.space.scale import Scale
+from pipeline.artifacts.teeth import Teeth
+from pipeline.stage import LocalContext
+from stages.dentition.crowns import Outline, dentition_of
+from stages.export.mesh.bend import bent
+from stages.export.mesh.jaws import jaws_of
+from stages.export.mesh.nets import zero_surface
+from stages.export.mesh.solid import _field, border_vertices, closed, is_closed, well_composed
+from stages.export.mesh.surface import Mesh
+from stages.export.mesh.texture.atlas import packed, textured
+from stages.export.mesh.texture.glb import write_glb
+from stages.export.mesh.texture.levelling import levelled
+from stages.export.mesh.texture.sight import sights
+from stages.export.stage import ExportConfig, ExportStage
+from tests.stages import export_scene as scene
+
+SIZE = 96
+
+
+def sheet(across: int, down: int, shape: Callable, color: Callable) -> Mesh:  # type: ignore[type-arg]
+    """A grid of triangles that faces -z, where `shape` (u, v) puts it; u, v are 0..1."""
+    u, v = np.meshgrid(np.linspace(0, 1, across), np.linspace(0, 1, down))
+    number = np.arange(across * down).reshape(down, across)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
+    vertices = np.stack(np.broadcast_arrays(*shape(u, v)), -1).reshape(-1, 3).astype(float)
+    colors = np.stack(np.broadcast_arrays(*color(u, v)), -1).reshape(-1, 3).astype(float)
+    mesh = Mesh(vertices, faces.astype(np.int32), colors)
+    a, b, c = vertices[mesh.faces[0]]
+    if np.cross(b - a, c - a)[2] > 0:
+        mesh = replace(mesh, faces=np.ascontiguousarray(mesh.faces[:, [0, 2, 1]]))
+    return mesh
+
+
+def flat() -> Mesh:
+    return sheet(
+        21, 21, lambda u, v: (2 * u - 1, 2 * v - 1, 0 * u), lambda u, v: (u, v, 0.5 + 0 * u)
+    )
+
+
+def camera(x: float, name: str = "000") -> Camera:
+    """4 before the sheet, which it sees from edge to edge if x is 0."""
+    pose = np.eye(4)
+    pose[:3, 3] = [-x, 0, 4]
+    return Camera(name, SIZE, SIZE, 2 * SIZE, 2 * SIZE, SIZE / 2, SIZE / 2, pose)
+
+
+def picture(of: Camera, mesh: Mesh, brighter: float = 0.0) -> np.ndarray:
+    """What a camera sees of the flat sheet, whose colour is its place."""
+    places = of.unproject(np.full((SIZE, SIZE), 4.0))
+    color = np.stack([(places[..., 0] + 1) / 2, (places[..., 1] + 1) / 2, 0.5 + 0 * places[..., 0]])
+    return np.clip(255 * color.transpose(1, 2, 0) * 0.8 + brighter, 0, 255).astype(np.uint8)
+
+
+def two_cameras() -> tuple[list[Camera], list[np.ndarray], dict[str, np.ndarray]]:
+    """Each sees half of the sheet alone; the second is brighter."""
+    cameras = [camera(-0.3, "000"), camera(0.3, "001")]
+    pictures = [picture(cameras[0], flat()), picture(cameras[1], flat(), 40)]
+    return cameras, pictures, {c.name: np.ones((SIZE, SIZE), bool) for c in cameras}
+
+
+def test_photographs_sit_where_they_were_taken(tmp_path: Path) -> None:
+    mesh = replace(flat(), colors=0.8 * flat().colors)
+    one, masks = camera(0.0), {"000": np.ones((SIZE, SIZE), bool)}
+    masks["000"][:20] = False
+    found = textured(mesh, sights(mesh, [one], masks), [picture(one, mesh)], 256)
+    assert 0.6 < found.photographed.mean() < 0.9, "what is masked is not used"
+    np.testing.assert_allclose(found.vertices[found.faces], mesh.vertices[mesh.faces])
+    write_glb(tmp_path / "mesh.glb", found.moved(np.diag([1e-3, 1e-3, 1e-3, 1])), {"a": 1})
+    read = trimesh.load(tmp_path / "mesh.glb").to_geometry()
+    assert read.faces.shape == mesh.faces.shape
+    np.testing.assert_allclose(np.ptp(read.vertices, axis=0), [2e-3, 2e-3, 0], atol=1e-9)
+    image = np.asarray(read.visual.material.baseColorTexture.convert("RGB")).astype(float)
+    middles = read.visual.uv[read.faces].mean(1)  # trimesh has v upwards
+    column = (middles[:, 0] * image.shape[1]).astype(int)
+    row = ((1 - middles[:, 1]) * image.shape[0]).astype(int)
+    truth = (1e3 * read.vertices[read.faces].mean(1) + 1) / 2 * 255
+    said = image[row, column, :2]
+    error = np.abs(said - 0.8 * truth[:, :2]).max(1)
+    assert error[found.photographed].max() < 8
+    assert error[~found.photographed].max() < 20
+
+
+def test_the_same_bytes_and_never_larger_than_asked() -> None:
+    mesh, (cameras, pictures, masks) = flat(), two_cameras()
+    first, again = (textured(mesh, sights(mesh, cameras, masks), pictures, 64) for _ in range(2))
+    assert first.picture == again.picture and first.places.tobytes() == again.places.tobytes()
+    width, height = Image.open(io.BytesIO(first.picture)).size
+    assert max(width, height) <= 64
+    assert (first.places >= 0).all() and (first.places <= 1).all()
+    part = first.part(np.arange(len(mesh.faces)) < 10)
+    np.testing.assert_allclose(part.vertices[part.faces], first.vertices[first.faces[:10]])
+
+
+def test_seams_are_evened_out() -> None:
+    mesh = flat()
+    label = (mesh.vertices[mesh.faces].mean(1)[:, 0] > 0).astype(np.int64)
+    colors = np.zeros((2, len(mesh.vertices), 3))
+    colors[0], colors[1] = 100, 160
+    added = levelled(mesh.faces, label, colors, np.full((len(mesh.vertices), 3), 50.0))
+    seam = np.intersect1d(mesh.faces[label == 0], mesh.faces[label == 1])
+    gap = np.abs((colors + added[:2])[0, seam] - (colors + added[:2])[1, seam])
+    assert gap.max() < 8, "60 before"
+    assert (
+        np.abs(added[0][~np.isin(np.arange(len(mesh.vertices)), mesh.faces[label == 0])]).max() == 0
+    )
+
+
+def test_rectangles_do_not_overlap() -> None:
+    sizes = [(int(w), int(h)) for w, h in np.random.default_rng(0).integers(1, 60, (40, 2))]
+    corners, width, height = packed(sizes, 200)
+    taken = np.zeros((height, width), int)
+    for (x, y), (w, h) in zip(corners, sizes, strict=True):
+        taken[y : y + h, x : x + w] += 1
+    assert taken.max() == 1 and taken.sum() == sum(w * h for w, h in sizes) and width <= 200
+
+
+def test_gums_go_with_the_nearest_crowns() -> None:
+    mesh, one = flat(), camera(0.0)
+    seen = sights(mesh, [one], {"000": np.ones((SIZE, SIZE), bool)})
+    crowns = np.zeros((SIZE, SIZE), np.int8)
+    crowns[25:44], crowns[50:60] = 1, -1  # y leads down
+    jaws = jaws_of(mesh, seen, [crowns])
+    assert set(jaws) == {"upper", "lower"} and (jaws["upper"] ^ jaws["lower"]).all()
+    height = mesh.vertices[mesh.faces].mean(1)[:, 1]
+    assert jaws["upper"][height < -0.15].all() and jaws["lower"][height > 0.1].all()
+    assert jaws_of(mesh, seen, [np.maximum(crowns, 0)]) == {}, "one jaw is not two"
+    assert jaws_of(mesh, seen, [None]) == {}
+
+
+def arch() -> Mesh:
+    """The outside of a small jaw in mm, wavy as teeth are: y up, the front towards z."""
+
+    def shape(u, v):  # type: ignore[no-untyped-def]
+        angle, y = np.pi * (0.15 + 0.7 * u), 7 * v
+        radius = 9 + 0.5 * np.cos(14 * angle) * (1 - v) + 0.6 * v
+        return radius * np.cos(angle), y, radius * np.sin(angle)
+
+    mesh = sheet(90, 30, shape, lambda u, v: (u, v, v))
+    middle = mesh.faces[len(mesh.faces) // 2]
+    a, b, c = mesh.vertices[middle]
+    outward = np.cross(b - a, c - a) @ (a * [1, 0, 1])
+    return mesh if outward > 0 else replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy())
+
+
+def test_a_closed_model_is_watertight_and_keeps_what_was_seen() -> None:
+    mesh = arch()
+    # a hole, as where nothing was seen
+    away = np.linalg.norm(mesh.vertices[mesh.faces].mean(1) - mesh.vertices[1245], axis=1) > 0.8
+    mesh = replace(mesh, faces=mesh.faces[away])
+    model = closed(mesh, height=3.0, depth=4.0, voxel=0.3)
+    assert model is not None and is_closed(model)
+    solid = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 300
+    assert solid.body_count == 1
+    top = model.vertices[:, 1].max()
+    assert top == pytest.approx(mesh.vertices[:, 1].max() + 3, abs=0.01)
+    flat_area = solid.area_faces[solid.face_normals[:, 1] > 0.999].sum()
+    assert flat_area > 50, "it stands on a base"
+    inner = mesh.vertices[~border_vertices(mesh)]
+    inner = inner[np.isin(np.arange(len(mesh.vertices)), mesh.faces)[~border_vertices(mesh)]]
+    from pipeline.geometry.mesh import Mesh as Surface
+
+    distances = Surface(model.vertices, model.faces).distances(inner)
+    assert np.percentile(distances, 95) < 0.05
+    open_model = replace(model, faces=model.faces[1:])
+    assert not is_closed(open_model)
+    assert not is_closed(replace(model, faces=model.faces[:, ::-1])), "inside out"
+
+
+def test_whatever_is_solid_gets_a_surface_without_loose_ends() -> None:
+    for seed in range(3):
+        noise = np.zeros((16, 16, 16), bool)
+        noise[2:14, 2:14, 2:14] = np.random.default_rng(seed).random((12, 12, 12)) < 0.35
+        solid = well_composed(noise)
+        assert (solid >= noise).all()
+        vertices, faces = zero_surface(_field(0.5 - solid.astype(np.float32), 1.0), 1)
+        assert is_closed(Mesh(vertices, faces, vertices))
+        assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
+
+
+def test_points_follow_the_bend_of_the_fit() -> None:
+    """The points of a ball that the fit made 3 % larger."""
+    cameras = scene.ball_cameras()
+    depths = [scene.ball_depth(camera) for camera in cameras]
+    start = scene.ball_points()
+    start = replace(start, positions=np.float32(0.97) * start.positions)
+    front = start.positions[:, 2] < -0.5
+    before = np.linalg.norm(start.positions[front], axis=1)
+    after = np.linalg.norm(bent(start, cameras, depths).positions[front], axis=1)
+    assert np.median(np.abs(before - 1)) > 0.029
+    assert np.median(np.abs(after - 1)) < 0.005
+    unknown = replace(start, normals=np.zeros_like(start.normals))
+    assert np.array_equal(bent(unknown, cameras, depths).positions, unknown.positions)
+    unseen = bent(start, cameras, [0 * depth for depth in depths])
+    assert np.array_equal(unseen.positions, start.positions)
+
+
+def ball_teeth() -> Teeth:
+    """Crowns on the ball: six above, six below."""
+    views = []
+    for one in scene.ball_cameras():
+        outlines = []
+        for place, (upper, lower) in enumerate(
+            zip((13, 12, 11, 21, 22, 23), (43, 42, 41, 31, 32, 33), strict=True)
+        ):
+            left = 50 + 11 * place
+            for jaw, number, y in (("upper", upper, 38), ("lower", lower, 64)):
+                corners = [(left, y), (left + 10, y), (left + 10, y + 18), (left, y + 18)]
+                polygon = np.array(corners, float)
+                outlines.append(Outline(polygon, jaw, 0.9, {number: 0.9}, number, 0.05))  # type: ignore[arg-type]
+        size = (scene.WIDTH, scene.HEIGHT)
+        views.append(dentition_of(outlines, one.name, size, "front", roll=0.0))
+    return Teeth(tuple(views))
+
+
+def export(folder: Path, scale: Scale, **settings: object) -> LocalContext:
+    case = scene.ball_case()
+    case["teeth"] = ball_teeth()
+    case["cameras"] = replace(
+        case["cameras"], scale=scale, mouth_from_world=np.diag([1.0, -1, -1, 1]),
+        input_from_world=np.diag([6.0, 6, 6, 1]),
+    )  # fmt: skip
+    config = ExportConfig(
+        mesh_faces=3000, mesh_resolution=64, mesh_views=2, video=False, viewer=False,
+        preview=False, colmap=False, splat_files=False, **settings,
+    )  # type: ignore[arg-type]  # fmt: skip
+    context = LocalContext(config, folder, case, threads=1)
+    ExportStage().run(context)
+    return context
+
+
+def test_the_stage_writes_each_jaw_and_models_of_both(tmp_path: Path) -> None:
+    scale = Scale("mm", "textbook_teeth", 15.0)
+    context = export(tmp_path, scale, mesh_base=True, mesh_base_height=2.0, mesh_base_depth=2.0)
+    assert not context.warnings
+    home = tmp_path / "exports"
+    description = json.loads((home / "scene.json").read_text())
+    names = {
+        f"mesh{part}.{end}" for part in ("", "_upper", "_lower") for end in ("ply", "stl", "glb")
+    }
+    names |= {"model_upper.stl", "model_lower.stl"}
+    assert names <= set(description["files"]) and not description["skipped"]
+    turned = description["frame"]["file_from_frame"]
+    np.testing.assert_allclose(np.diag(turned["mesh_upper.glb"]), [1e-3, 1e-3, 1e-3, 1])
+    whole = trimesh.load(home / "mesh.ply")
+    parts = {}
+    for jaw, up in (("upper", 1), ("lower", -1)):
+        part = parts[jaw] = trimesh.load(home / f"mesh_{jaw}.ply")
+        assert up * np.median(part.vertices[:, 1]) > 1
+        model = trimesh.load(home / f"model_{jaw}.stl")
+        assert model.is_watertight and model.is_winding_consistent and model.volume > 50
+        assert turned[f"model_{jaw}.stl"] == turned["mesh.stl"]
+        base = (up * model.vertices[:, 2]).max()  # z is up in .stl
+        assert base == pytest.approx((up * part.vertices[:, 1]).max() + 2, abs=0.05)
+        textured_part = trimesh.load(home / f"mesh_{jaw}.glb").to_geometry()
+        np.testing.assert_allclose(1e3 * textured_part.bounds, part.bounds, atol=1e-3)
+    assert sum(len(part.faces) for part in parts.values()) == len(whole.faces)
+    text = (home / "README.txt").read_text()
+    assert "made up, not measured" in text and "metres" in text
+
+
+def test_without_a_scale_no_model_is_made_and_why_is_said(tmp_path: Path) -> None:
+    context = export(tmp_path, Scale(), mesh_base=True, mesh_texture=0)
+    assert len(context.warnings) == 1 and "no scale is known" in context.warnings[0]
+    names = {path.name for path in (tmp_path / "exports").iterdir()}
+    assert "mesh_upper_without_scale.stl" in names
+    assert not any(name.endswith(".glb") or name.startswith("model") for name in names)
+    description = json.loads((tmp_path / "exports" / "scene.json").read_text())
+    assert "model" in description["skipped"]
