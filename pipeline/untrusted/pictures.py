@@ -22,14 +22,16 @@ from pipeline.untrusted.files import UnusableFile
 if TYPE_CHECKING:
     from PIL import Image
 
-KNOWN = "JPEG, PNG, TIFF, WebP, HEIC or BMP"
+KNOWN = "JPEG, PNG, TIFF, WebP, HEIC, BMP or DICOM"
 MAX_PIXELS = 300_000_000
 #: The longest side that a JPEG can have.
 MAX_SIDE = 65_535
 #: Bytes that decoding one picture may take: ten for each of the most pixels.
 MOST_MEMORY = 10 * MAX_PIXELS
 #: Kinds whose decoders are run in a process of their own.
-APART = ("HEIF", "TIFF")
+APART = ("HEIF", "TIFF", "DICOM")
+#: Where a DICOM file says that it is one, and how (PS3.10, 7.1).
+DICOM_MARK = (128, b"DICM")
 
 _HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
 _OTHERS = (
@@ -51,7 +53,7 @@ _OTHERS = (
     (4, b"ftyp", "a film"),
     (4, b"moov", "a film"),
     (0, b"\x1aE\xdf\xa3", "a film"),
-    (128, b"DICM", "a DICOM file"),
+    (*DICOM_MARK, "a DICOM file"),
 )
 
 
@@ -60,8 +62,9 @@ class Header:
     """What the first bytes of a picture say.
 
     Attributes:
-        kind: JPEG, PNG, TIFF, WEBP, HEIF or BMP.
-        width, height: of the stored grid; 0 where only the decoder of the kind can tell (HEIF).
+        kind: JPEG, PNG, TIFF, WEBP, HEIF, BMP or DICOM.
+        width, height: of the stored grid; 0 where only the decoder of the kind can tell (HEIF,
+            DICOM).
         bits: of a channel.
         memory: bytes a pixel that decoding it takes at most, measured; `benchmarks/pictures.py`.
     """
@@ -88,7 +91,7 @@ def look(data: bytes) -> Header:
         header = _READERS[kind](data)
     except (struct.error, IndexError) as error:
         raise UnusableFile("is truncated: the end of the file is missing") from error
-    if kind != "HEIF":
+    if kind not in ("HEIF", "DICOM"):
         check_size(header.width, header.height, header.memory)
     return header
 
@@ -139,11 +142,14 @@ def opened(data: bytes, header: Header) -> Image.Image:
         header: what `look` found.
 
     Raises:
-        UnusableFile: it is not what its first bytes say, or too large.
+        UnusableFile: it is not what its first bytes say, too large, or a DICOM file, which Pillow
+            does not read.
         Others: what Pillow raises of damaged files.
     """
     from PIL import Image, UnidentifiedImageError
 
+    if header.kind == "DICOM":
+        raise UnusableFile("is a DICOM file, which only a photograph may be")
     _import_decoder(header.kind)
     try:
         image: Image.Image = Image.open(io.BytesIO(data), formats=[header.kind])
@@ -173,6 +179,8 @@ def gray(data: bytes) -> npt.NDArray[np.uint8]:
     import cv2
 
     header = look(data)
+    if header.kind == "DICOM":
+        raise UnusableFile("is a DICOM file, which only a photograph may be")
     if header.kind == "PNG":
         data = bare_png(data)
     try:
@@ -221,7 +229,10 @@ def _kind(data: bytes) -> str | None:
         return "WEBP"
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC:
         return "HEIF"
-    return "BMP" if data[:2] == b"BM" else None
+    if data[:2] == b"BM":
+        return "BMP"
+    place, mark = DICOM_MARK
+    return "DICOM" if data[place : place + len(mark)] == mark else None
 
 
 def _jpeg(data: bytes) -> Header:
@@ -324,6 +335,11 @@ def _heif(data: bytes) -> Header:
     return Header("HEIF", memory=12.0)
 
 
+def _dicom(data: bytes) -> Header:
+    return Header("DICOM")
+
+
 _READERS: dict[str, Callable[[bytes], Header]] = {
     "JPEG": _jpeg, "PNG": _png, "TIFF": _tiff, "WEBP": _webp, "HEIF": _heif, "BMP": _bmp,
+    "DICOM": _dicom,
 }  # fmt: skip

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from pipeline.errors import RequestError, nearest
-from pipeline.untrusted.files import sort_of
+from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, opened, sort_of
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.pictures import KNOWN
+from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
 from stages.views.sampling import natural_key
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
+IMAGE_SUFFIXES = (
+    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp",
+    ".dcm", ".dicom",
+)  # fmt: skip
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
 )  # fmt: skip
@@ -54,6 +57,24 @@ def list_folder(folder: Path) -> list[Entry]:
 
 def is_image(path: PurePath) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def is_photograph(path: Path) -> bool:
+    """Is it a picture by its name, or a DICOM file without a suffix, as archives write them?
+
+    Names of these end in digits: ``IM_0001``, ``1.2.840.113619.2.5``. Only such are looked into.
+    """
+    if is_image(path):
+        return True
+    no_suffix = not path.suffix or path.suffix[1:].isdigit()
+    if not no_suffix or path.name.upper() == "DICOMDIR":  # that is a list of files
+        return False
+    place, mark = DICOM_MARK
+    try:
+        with opened(path, PHOTOGRAPH) as file:
+            return file.read(place + len(mark))[place:] == mark
+    except (UnusableFile, OSError):
+        return False
 
 
 def is_video(path: PurePath) -> bool:
@@ -183,7 +204,7 @@ def _expand(item: str | Path) -> list[Path]:
     if stat.S_ISDIR(status.st_mode):
         return _expand_folder(path)
     _refuse_special(path, "Among the photographs,")
-    if not is_image(path) and not is_video(path):
+    if not is_photograph(path) and not is_video(path):
         raise RequestError(
             f"The file {printable(path.name)} is neither a photograph nor a video by its name "
             f"('{path.suffix or 'no suffix'}'). Photographs are {KNOWN}; videos are MP4, "
@@ -194,7 +215,7 @@ def _expand(item: str | Path) -> list[Path]:
 
 def _expand_pattern(path: Path) -> list[Path]:
     matches = [Path(match) for match in glob.glob(str(path), recursive=True)]  # noqa: PTH207
-    usable = [m for m in matches if (is_image(m) or is_video(m)) and not m.is_dir()]
+    usable = [m for m in matches if not m.is_dir() and (is_photograph(m) or is_video(m))]
     if not usable:
         what = (
             f"matches {len(matches)} files, none of them a photograph"
@@ -222,7 +243,7 @@ def _refuse_special(path: Path, what: str) -> None:
 
 def _expand_folder(folder: Path) -> list[Path]:
     entries = list_folder(folder)
-    images = [entry.path for entry in entries if is_image(entry.path) and not entry.is_folder]
+    images = [entry.path for entry in entries if not entry.is_folder and is_photograph(entry.path)]
     for image in images:
         _refuse_special(image, "Among the photographs,")
     if images:
@@ -233,7 +254,9 @@ def _expand_folder(folder: Path) -> list[Path]:
         advice = f"To use the video, name it: {folder / videos[0]}"
     else:
         for entry in entries:
-            if entry.is_folder and any(is_image(inner.path) for inner in _try_list(entry.path)):
+            if entry.is_folder and any(
+                is_photograph(inner.path) for inner in _try_list(entry.path)
+            ):
                 advice = f"Did you mean the folder in it: {entry.path}"
                 break
     raise RequestError(f"There is no photograph in {folder} ({_describe(entries)}). {advice}")

@@ -57,7 +57,7 @@ class ViewsStage(Stage):
     provides: ClassVar[tuple[str, ...]] = ("views",)
     may_provide: ClassVar[tuple[str, ...]] = ("held_out",)
     libraries: ClassVar[tuple[str, ...]] = (
-        "av", "opencv-contrib-python-headless", "pillow", "pillow-heif",
+        "av", "opencv-contrib-python-headless", "pillow", "pillow-heif", "pydicom",
     )  # fmt: skip
     uses_sources: ClassVar[bool] = True
     thrift: ClassVar[str] = (

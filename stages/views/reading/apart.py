@@ -1,4 +1,4 @@
-"""Decode the photographs of a case: HEIC and TIFF in processes that may die of a damaged file."""
+"""Decode the photographs of a case: HEIC, TIFF, DICOM in processes that may die of a bad file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.installed import is_installed
 from pipeline.untrusted.child import Children, Reply, seconds_for
+from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.pictures import APART, MOST_MEMORY, large_pictures, look
 from stages.views.reading.decode import Photo, decode_mask, decode_photo
 
@@ -18,12 +20,15 @@ class Decoder:
     """Decodes while it is entered; threads may share it."""
 
     def __init__(self) -> None:
-        self._children = Children("stages.views.reading.decode_child:work", MOST_MEMORY + (1 << 30))
+        memory = MOST_MEMORY + (1 << 30)
+        self._children = Children("stages.views.reading.decode_child:work", memory)
+        self._of_dicom = Children("stages.views.reading.dicom_child:work", memory)
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
         self._open.enter_context(large_pictures())
         self._open.callback(self._children.close)
+        self._open.callback(self._of_dicom.close)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -32,12 +37,19 @@ class Decoder:
     def stop(self) -> None:
         """Let go of what is being decoded; its threads are told."""
         self._children.stop()
+        self._of_dicom.stop()
 
     def photo(self, data: bytes, check_size: Callable[[int, int], None]) -> Photo:
         """As `decode_photo`."""
-        if look(data).kind not in APART:
+        kind = look(data).kind
+        if kind not in APART:
             return decode_photo(data, check_size)
-        [(reply, arrays)] = self._ask("photo", data)
+        if kind == "DICOM" and not is_installed("pydicom"):
+            raise UnusableFile(
+                "is a DICOM file, and what reads these is not installed: pip install "
+                "'dentalsplat[dicom]', or save it as JPEG"
+            )
+        [(reply, arrays)] = self._ask("photo", data, dicom=kind == "DICOM")
         valid = arrays[1] if len(arrays) > 1 else None
         check_size(arrays[0].shape[1], arrays[0].shape[0])
         return Photo(arrays[0], valid, reply["orientation"], reply["focal_px"])
@@ -49,6 +61,7 @@ class Decoder:
         [(_, arrays)] = self._ask("mask", data)
         return arrays[0]
 
-    def _ask(self, what: str, data: bytes) -> list[Reply]:
+    def _ask(self, what: str, data: bytes, *, dicom: bool = False) -> list[Reply]:
         packed = np.frombuffer(data, np.uint8)
-        return list(self._children.ask({"what": what}, [packed], seconds_for(len(data))))
+        children = self._of_dicom if dicom else self._children
+        return list(children.ask({"what": what}, [packed], seconds_for(len(data))))

@@ -75,7 +75,7 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
             with _one_large if width * height > LARGE else nullcontext():
                 image.load()
                 deep = header.bits == 16 and header.kind in ("PNG", "TIFF")
-                rgb, valid = _deep(data, header, image, profile) if deep else _shown(image, profile)
+                rgb, valid = _deep(data, header, image, profile) if deep else shown(image, profile)
             if header.kind == "TIFF":  # Pillow and OpenCV have turned it upright
                 rgb = make_stored(rgb, orientation)
                 valid = None if valid is None else make_stored(valid, orientation)
@@ -177,8 +177,12 @@ def _deep(
     return _to_srgb(strips(), height, width, profile)
 
 
-def _shown(image: Image.Image, profile: bytes | None) -> tuple[Bytes, Valid | None]:
-    """A decoded 8-bit picture of any mode as sRGB."""
+def shown(image: Image.Image, profile: bytes | None) -> tuple[Bytes, Valid | None]:
+    """A decoded 8-bit picture of any mode as sRGB, and where it is opaque.
+
+    Args:
+        profile: of its colours (ICC), if any.
+    """
     width, height = image.size
 
     def strips() -> Iterator[tuple[Image.Image, Valid | None]]:
