@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
@@ -30,6 +30,7 @@ __all__ = [
     "ReconstructionError",
     "RequestError",
     "StageError",
+    "batch",
     "benchmark",
     "clean",
     "compare",
@@ -207,6 +208,48 @@ def benchmark(
     return _engine().benchmark(
         suite, out=out, data=data, jobs=jobs, overrides=overrides, share=share, say=say
     )
+
+
+def batch(
+    cases: str | Path,
+    *,
+    out: str | Path | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    preset: str | Path | None = None,
+    overrides: Settings = (),
+    stages: Sequence[str] | None = None,
+    retry: Sequence[str] = (),
+    keep: Literal["workspace", "results"] = "workspace",
+    memory: float | None = None,
+    minutes: float | None = None,
+    share: Share | None = None,
+) -> dict[str, Any]:
+    """Run many cases, each in a process of its own; finished ones are not run again.
+
+    Args:
+        cases: a folder with a folder of photographs (or a film) for each case, or a CSV file.
+        out: folder for workspaces and summary; default ``./runs/batch_<name of the cases>``.
+        jobs: cases at a time on this machine; the cores are divided between them.
+        scheduler: address or file of a Dask scheduler, to run on its workers instead.
+        preset, overrides, stages: as for `run`, for all cases.
+        retry: ``failed``, or names of cases: run these again though they came to an end.
+        keep: ``results``: of a case that went well only these are kept, at most 8 MB.
+        memory: gigabytes that one case may take; None: an equal share; 0: no limit.
+        minutes: that one case may take; None: as many as it needs.
+        share: who else may read the folder; see `run`.
+
+    Returns:
+        ``{"folder", "cases": [record, ...], "counts": {state: number}, "seconds"}``.
+
+    Raises:
+        RequestError: the request is wrong, another batch works in the folder, the disk is full, or
+            the scheduler is gone.
+    """
+    return _engine().batch(
+        cases, out=out, jobs=jobs, scheduler=scheduler, preset=preset, overrides=overrides,
+        stages=stages, retry=retry, keep=keep, memory=memory, minutes=minutes, share=share,
+    )  # fmt: skip
 
 
 def clean(

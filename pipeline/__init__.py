@@ -24,6 +24,7 @@ _HOMES = {
     "doctor": "pipeline.front.checkup",
     "settings": "pipeline.front.settings",
     "benchmark": "pipeline.studies.benchmark.running",
+    "batch": "pipeline.studies.batch.running",
     "run_report": "pipeline.studies.report",
     "compare": "pipeline.studies.compare.compare",
     "PipelineError": "pipeline.errors",

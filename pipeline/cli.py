@@ -11,9 +11,25 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from pipeline.errors import PipelineError, RequestError, nearest
+from pipeline.errors import PipelineError, RequestError
+from pipeline.front import completion
+from pipeline.front.options import (
+    AsJson,
+    Images,
+    Overrides,
+    Preset,
+    Quiet,
+    Sharing,
+    Stages,
+    Verify,
+    Workspace,
+    names,
+    only_workspace,
+    sharing,
+)
+from pipeline.front.study_commands import register_studies
 from pipeline.process import signals
-from pipeline.process.privacy import SHARES, Share, private_from_now_on
+from pipeline.process.privacy import private_from_now_on
 from pipeline.untrusted.names import let_streams_show_all
 
 EXAMPLES = """\
@@ -31,7 +47,10 @@ dentalsplat turns a few photographs of teeth into a 3D scene that you can turn a
   pipeline stages                           the stages and their methods
   pipeline settings fit                     what can be set in a stage, and what it means
   pipeline compare -w cases/anna --run-colmap       beside COLMAP on the same photographs
+  pipeline register cases/may cases/june    two visits of one patient: which teeth moved
   pipeline benchmark smoke                  methods side by side, in the paper's tables
+  pipeline batch cases/ --jobs 2            many cases, a folder each, and a table of them
+  pipeline dicom -w cases/anna              pictures and mesh as DICOM files
   pipeline doctor                           is everything installed?
   pipeline warmup                           compile the kernels ahead (for an image)
   pipeline clean -w cases/anna              delete results that are not in use
@@ -40,44 +59,10 @@ When a run ends, open WORKSPACE/results/viewer.html in a browser. 'pipeline run 
 """
 
 app = typer.Typer(
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Photographs of teeth in, a 3D scene out; no GPU, no model weights, no network.",
 )
-
-Images = Annotated[
-    list[str] | None,
-    typer.Argument(
-        help="A folder, files, a quoted glob pattern, or one video.", show_default=False
-    ),
-]
-Workspace = Annotated[
-    Path | None,
-    typer.Option("-w", "--workspace", help="Where results are kept.  [default: ./runs/<input>]"),
-]
-Preset = Annotated[
-    str | None, typer.Option("-c", "--config", help="A preset's name, or a YAML file.")
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="stage.key=value, as in fit.iterations=500. May be repeated."),
-]
-Stages = Annotated[
-    str | None, typer.Option("--stages", help="Only these, in this order: init,sap,fit.")
-]
-Verify = Annotated[
-    bool,
-    typer.Option("--verify", help="Read every byte of the cached results again."),
-]
-Sharing = Annotated[
-    str | None,
-    typer.Option(
-        "--share", metavar="[nobody|group]", show_default=False,
-        help="Who else may read what is written.  [default: as the workspace is, first nobody]",
-    ),
-]  # fmt: skip
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -107,7 +92,12 @@ def run_command(
         int | None, typer.Option("--frames", help="Use this many, uniformly sampled.")
     ] = None,
     from_stage: Annotated[
-        str | None, typer.Option("--from", help="Begin at this stage; take the rest as it is.")
+        str | None,
+        typer.Option(
+            "--from",
+            autocompletion=completion.stage,
+            help="Begin at this stage; take the rest as it is.",
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Compute anew what is cached.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would run.")] = False,
@@ -117,6 +107,10 @@ def run_command(
         bool, typer.Option("--profile", help="Write WORKSPACE/profile/STAGE.html: where time goes.")
     ] = False,
     as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Say more: each step, keys, memory.")
+    ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the whole trace of an error.")
     ] = False,
@@ -134,20 +128,20 @@ def run_command(
         workspace=workspace,
         preset=config,
         overrides=changes,
-        stages=_names(stages),
+        stages=names(stages),
         from_stage=from_stage,
         force=force,
         dry_run=dry_run,
         verify=verify,
-        share=_share(share),
+        share=sharing(share),
         profile=profile,
-        reporter=make_reporter(quiet=dry_run),
+        reporter=make_reporter(quiet=quiet or dry_run, verbose=verbose),
     )
     if as_json:
         print(json.dumps(summary.to_dict(), indent=1))
     elif dry_run:
         print_dry_run(summary)
-    else:
+    elif not quiet:
         print_summary(summary)
 
 
@@ -167,10 +161,10 @@ def status_command(
 
     found = status(
         images or [],
-        workspace=workspace if workspace or images else _only_workspace(),
+        workspace=workspace if workspace or images else only_workspace(),
         preset=config,
         overrides=overrides or [],
-        stages=_names(stages),
+        stages=names(stages),
         verify=verify,
     )
     if as_json:
@@ -193,7 +187,7 @@ def report_command(
     """Write WORKSPACE/report.html: what came out, how sure it is, and everything behind it."""
     from pipeline.studies.report import run_report
 
-    print(run_report(workspace or _only_workspace(), anonymous=anonymous))
+    print(run_report(workspace or only_workspace(), anonymous=anonymous))
 
 
 @app.command("stages")
@@ -212,7 +206,10 @@ def stages_command(as_json: AsJson = False) -> None:
 @app.command("settings")
 def settings_command(
     stage: Annotated[
-        str | None, typer.Argument(metavar="[STAGE]", help="Only those of this stage.")
+        str | None,
+        typer.Argument(
+            metavar="[STAGE]", autocompletion=completion.stage, help="Only those of this stage."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -264,89 +261,23 @@ def warmup_command() -> None:
         raise typer.Exit(1)
 
 
-@app.command("compare")
-def compare_command(
-    workspace: Workspace = None,
-    colmap: Annotated[
-        Path | None,
-        typer.Option("--colmap", help="Folder of a COLMAP model of the same photographs."),
-    ] = None,
-    run_colmap: Annotated[
-        bool, typer.Option("--run-colmap", help="Run COLMAP here, with two settings.")
-    ] = False,
-    ground_truth: Annotated[
-        Path | None,
-        typer.Option("--ground-truth", help="True cameras: transforms.json or a COLMAP model."),
-    ] = None,
-    mesh: Annotated[
-        Path | None, typer.Option("--mesh", help="True surface, in the frame of --ground-truth.")
-    ] = None,
-    fit: Annotated[
-        bool, typer.Option("--fit/--no-fit", help="Also fit from COLMAP's cameras and points.")
-    ] = True,
-    threads: Annotated[int, typer.Option("--threads", min=0, help="0: all cores.")] = 0,
-    as_json: AsJson = False,
-) -> None:
-    """Set the cameras, points and fit of a run beside COLMAP's on the same views.
-
-    To run the pipeline itself on COLMAP's results: --set init.cameras=MODEL takes its cameras from
-    the start (init.points=model: its points too), and --stages views,init,align,swap,sap,flow,fit
-    --set swap.cameras=MODEL puts them in place of ours after any stage; fit.optimize_poses=false
-    keeps them. Results: WORKSPACE/compare/comparison.json, comparison.md and report.html.
-    """
-    from pipeline.front.progress import make_reporter
-    from pipeline.studies.compare.compare import compare
-    from pipeline.studies.compare.tables import print_tables, tables_of
-
-    found = compare(
-        workspace or _only_workspace(), colmap=colmap, run_colmap=run_colmap,
-        ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads, reporter=make_reporter(),
-    )  # fmt: skip
-    if as_json:
-        print(json.dumps(found.figures, indent=1))
-    else:
-        print_tables(tables_of(found.figures))
-        print(f"\nResults: {found.folder}/")
+register_studies(app)
 
 
-@app.command("benchmark")
-def benchmark_command(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite's name, or a YAML file.")],
+@app.command("register")
+def register_command(
+    first: Annotated[Path, typer.Argument(metavar="A", help="Workspace of the first visit.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Workspace of the second visit.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--out", help="Folder of the results.  [default: ./runs/benchmark_SUITE]"
-        ),
+        typer.Option("-o", "--out", help="Folder of the results.  [default: B/register]"),
     ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option("--data", help="Where the suite's data are, if not where it says."),
-    ] = None,
-    jobs: Annotated[
-        int, typer.Option("--jobs", min=1, help="Workspaces at a time; they share the cores.")
-    ] = 1,
-    overrides: Overrides = None,
-    share: Sharing = None,
-    as_json: AsJson = False,
 ) -> None:
-    """Compare methods on scenes and numbers of views, and write the paper's tables of them.
+    """Two visits of one patient in one frame: which teeth moved, how far and which way."""
+    from pipeline.studies.register import run_register
 
-    For example: pipeline benchmark smoke -o runs/smoke; or, with the data of a suite elsewhere:
-    pipeline benchmark configs/suites/paper.yaml --data ../data --jobs 2. Finished cells are not run
-    again. Results: tables.md, tables.csv, results.json and report.html.
-    """
-    from pipeline.studies.benchmark.running import benchmark
-    from pipeline.studies.benchmark.writing import markdown
-
-    results = benchmark(
-        suite, out=out, data=data, jobs=jobs, overrides=overrides or [],
-        share=_share(share), say=lambda text: print(text, file=sys.stderr, flush=True),
-    )  # fmt: skip
-    print(json.dumps(results, indent=1) if as_json else markdown(results), end="\n" * as_json)
-    if results["problems"]:
-        print("\n" + "\n".join(results["problems"]), file=sys.stderr)
-        faults = any(cell["status"] == "fault" for cell in results["cells"])
-        raise typer.Exit(1 if faults else 2)
+    page, said = run_register(first, second, out)
+    print(f"{said}\n\nLook at it: open {page} in a browser.")
 
 
 @app.command("clean")
@@ -363,7 +294,7 @@ def clean_command(
     """Delete results that are not in use; what a stopped run can go on from is kept."""
     from pipeline.workspace import checkpoints, clean
 
-    folder = workspace or _only_workspace()
+    folder = workspace or only_workspace()
     removed, freed = clean(folder, keep=keep, everything=everything)
     kept = checkpoints(folder)
     if as_json:
@@ -374,32 +305,6 @@ def clean_command(
         for name in removed:
             print(f"deleted {name}")
         print(f"{len(removed)} results deleted, {freed / 2**20:.1f} MB freed")
-
-
-def _names(stages: str | None) -> list[str] | None:
-    if stages is None:
-        return None
-    return [name.strip() for name in stages.split(",") if name.strip()]
-
-
-def _share(text: str | None) -> Share | None:
-    if text is None:
-        return None
-    for share in SHARES:
-        if text == share:
-            return share
-    raise RequestError(f"--share {text}: it may be {' or '.join(SHARES)}.{nearest(text, SHARES)}")
-
-
-def _only_workspace() -> Path:
-    """The workspace to speak of where none is named: this folder, or the only one under runs/."""
-    if Path("request.json").exists():
-        return Path()
-    found = sorted(path.parent for path in Path("runs").glob("*/request.json"))
-    if len(found) == 1:
-        return found[0]
-    some = f" ({', '.join(map(str, found[:5]))})" if found else ""
-    raise RequestError(f"Say which workspace: -w FOLDER{some}.")
 
 
 def program() -> int:

@@ -40,6 +40,17 @@ def reset_peak() -> bool:
     return True
 
 
+def peak_mb_with_children() -> float:
+    """The most memory that this process, or one that it has waited for, has held, in MiB."""
+    own = peak_mb(False)
+    try:
+        import resource
+    except ImportError:
+        return own
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return max(own, children / (2**20 if sys.platform == "darwin" else 1024))
+
+
 def peak_mb(resettable: bool) -> float:
     """The most memory this process has held, in MiB; 0 where the system can't say.
 

@@ -146,23 +146,46 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
     available = set(table)
     for name in chain.names:
         stage = get_stage(name)
-        for kind in stage.requires:
-            if kind not in available:
-                raise RequestError(_nobody_provides(name, kind))
+        lacking = [kind for kind in stage.requires if kind not in available]
+        if lacking:
+            raise RequestError(_nobody_provides(name, lacking, chain, available))
         available |= set(stage.provides)
     return table
 
 
-def _nobody_provides(name: str, kind: str) -> str:
+def _nobody_provides(name: str, kinds: Sequence[str], chain: Chain, held: set[str]) -> str:
+    """All that a stage lacks, who would make it, what there is, and where to begin instead."""
     usable = usable_stages()
-    makers = [n for n, stage in usable.items() if kind in stage.provides and n != name]
-    from_where = f" ({' or '.join(makers)} would make them)" if makers else ""
-    if makers and all(usable[maker].uses_sources for maker in makers):
+    others = {n: stage for n, stage in usable.items() if n != name}
+    makers = {kind: [n for n, s in others.items() if kind in s.provides] for kind in kinds}
+    if all(makers[kind] for kind in kinds) and all(
+        usable[maker].uses_sources for names in makers.values() for maker in names
+    ):
         return f"The stage '{name}' needs photographs: give a folder, files, a glob or a video."
+    wanted = [
+        f"{kind} ({' or '.join(makers[kind])} would make them)" if makers[kind] else kind
+        for kind in kinds
+    ]
+    has = f" It holds {', '.join(sorted(held))}." if held else " It holds nothing yet."
+    start = _first_to_run(kinds, chain, held, others)
+    advice = f"Begin there: --from {start}." if start else "Add such a stage to --stages."
     return (
-        f"The stage '{name}' needs {kind}, which no earlier stage of this run provides and this "
-        f"workspace does not hold{from_where}. Add such a stage to --stages."
+        f"The stage '{name}' needs {' and '.join(wanted)}, which no earlier stage of this run "
+        f"provides and this workspace does not hold.{has} {advice}"
     )
+
+
+def _first_to_run(
+    kinds: Sequence[str], chain: Chain, held: set[str], others: Mapping[str, Stage]
+) -> str | None:
+    """The earliest stage before the chain that has to run for these kinds; None: there is none."""
+    wanted, first = set(kinds), None
+    for name in reversed(chain.upstream):
+        stage = others.get(name)
+        if stage is not None and wanted & set(stage.provides):
+            first = name
+            wanted |= {kind for kind in stage.requires if kind not in held}
+    return first
 
 
 def key_material(

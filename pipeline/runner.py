@@ -39,6 +39,9 @@ class Reporter:
     def start(self, stages: list[str]) -> None:
         """A run of these stages begins."""
 
+    def foreseen(self, stages: list[StageOutcome]) -> None:
+        """What is going to be done, before it starts (as `Runner.dry_run` tells it)."""
+
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
         """A stage begins to compute."""
 
@@ -63,7 +66,8 @@ class StageOutcome:
         action: ``ran``, ``resumed`` (ran, from a checkpoint) or ``cached``; in a dry run ``would
             run`` or ``unknown`` (depends on what an earlier stage will give).
         reasons: why it ran.
-        figures: wall_seconds, cpu_seconds, peak_memory_mb of when it was computed, and `summary`.
+        figures: wall_seconds, cpu_seconds, peak_memory_mb of when it was computed, and `summary`;
+            before it runs, wall_seconds of its last time alone, if there was one.
     """
 
     name: str
@@ -201,6 +205,7 @@ class Runner:
         self.request.save()
         self.reporter.start(list(self.chain.names))
         try:
+            self.reporter.foreseen(self._foreseen(planned, force))
             self._check_upstream()
             with self._kernels(stage.name for stage in planned if force or stage.result is None):
                 return self._run_all(force)
@@ -231,16 +236,21 @@ class Runner:
 
     def dry_run(self, *, force: bool = False) -> RunSummary:
         """Only say what would be done."""
-        summary = RunSummary(self.request.workspace)
-        for stage in self.plan():
+        return RunSummary(self.request.workspace, self._foreseen(self.plan(), force))
+
+    def _foreseen(self, planned: Iterable[PlannedStage], force: bool) -> list[StageOutcome]:
+        found = []
+        for stage in planned:
             forced = force and stage.name not in self.chain.implicit
             if stage.state == "cached":
                 action, reasons = ("would run", ["--force"]) if forced else ("cached", [])
             else:
                 action = "unknown" if stage.state == "pending" else "would run"
                 reasons = stage.reasons
-            summary.stages.append(StageOutcome(stage.name, action, reasons, stage.key))
-        return summary
+            last = stage.result or self.store.current(stage.name)
+            figures = {"wall_seconds": last.manifest["wall_seconds"]} if last else {}
+            found.append(StageOutcome(stage.name, action, reasons, stage.key, figures=figures))
+        return found
 
     def _check_upstream(self) -> None:
         """Warn where the results taken as they are do not fit together."""

@@ -29,6 +29,7 @@ class Request:
     Attributes:
         images: the photographs that the user named, or those that the workspace was last run on.
         images_named: whether the user named them.
+        taken_over: what of preset and overrides is the last run's, as the command line has it.
     """
 
     workspace: Path
@@ -38,6 +39,7 @@ class Request:
     stages: tuple[str, ...] | None
     from_stage: str | None = None
     images_named: bool = True
+    taken_over: tuple[str, ...] = ()
 
     def save(self) -> None:
         """Remember the request in the workspace, for `status` and for runs that name no images."""
@@ -93,18 +95,33 @@ def make_request(
     overrides: Iterable[str] | Mapping[str, Any] = (),
     stages: Sequence[str] | None = None,
     from_stage: str | None = None,
+    *,
+    as_before: bool = False,
 ) -> Request:
-    """Complete what the user said with what the workspace remembers (its photographs)."""
+    """Complete what the user said with what the workspace remembers (its photographs).
+
+    Args:
+        as_before: where no photographs are named, go on with the preset and the overrides of the
+            last run; those given now come on top. A preset that is named starts from that.
+    """
     given = [images] if isinstance(images, str | Path) else list(images)
     if workspace is None:
         workspace = default_workspace(given)
     folder = Path(workspace)
     images_named = bool(given)
-    if not given:
-        remembered = read_request(folder) if is_workspace(folder) else {}
-        given = [p for p in remembered.get("images", []) if _still_there(p)]
+    taken_over: list[str] = []
     if isinstance(overrides, Mapping):
         overrides = [f"{key}={_yaml_value(value)}" for key, value in overrides.items()]
+    if not given:
+        remembered = read_request(folder) if is_workspace(folder) else {}
+        if as_before and preset is None and remembered:
+            now = list(overrides)
+            named = {change.partition("=")[0].strip() for change in now}
+            kept = [c for c in remembered["overrides"] if c.partition("=")[0].strip() not in named]
+            preset, overrides = remembered["preset"], [*kept, *now]
+            taken_over = [f"-c {preset}"] if preset else []
+            taken_over += [f"--set {change}" for change in kept]
+        given = [p for p in remembered.get("images", []) if _still_there(p)]
     return Request(
         workspace=folder,
         images=tuple(os.path.abspath(p) for p in given),  # noqa: PTH100 - keeps glob characters
@@ -113,6 +130,7 @@ def make_request(
         stages=tuple(stages) if stages else None,
         from_stage=from_stage,
         images_named=images_named,
+        taken_over=tuple(taken_over),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -15,6 +16,7 @@ from make_samples import sky_share, vertex_normals
 
 from .arrange import Row, Tooth, arrange
 from .hardware import brackets
+from .moves import Move, moved_row
 from .options import MouthOptions, random_options
 from .rays import ray_scene
 from .tissue import above_gum, grow_gum, tongue
@@ -120,10 +122,17 @@ def random_mouth(rng: np.random.Generator, **overrides: Any) -> Mouth:
     return build_mouth(random_options(rng, **overrides))
 
 
-def build_mouth(options: MouthOptions) -> Mouth:
-    """Grow the mouth that the options describe; the same options give the same mouth."""
+def build_mouth(options: MouthOptions, moves: Mapping[int, Move] | None = None) -> Mouth:
+    """Grow the mouth that the options describe; the same options give the same mouth.
+
+    Args:
+        options: of the mouth.
+        moves: FDI number -> what this tooth did since the mouth was as the options say; the gum
+            grows around the teeth where they stand now.
+    """
     rng = np.random.default_rng(options.seed)
-    rows = arrange(options, rng)
+    upper, lower_row = (moved_row(row, moves or {}) for row in arrange(options, rng))
+    rows = upper, lower_row
     teeth = rows[0].teeth + rows[1].teeth
     bits: list[tuple[Array, Array, Array, npt.NDArray[np.int32]]] = []
     marks: list[tuple[int, Tissue, bool, int]] = []

@@ -37,6 +37,7 @@ LIBRARIES = {
 OPTIONAL = {
     "torch": ("torch", "LPIPS, pointmap models and the GPU"),
     "torchmetrics": ("torchmetrics", "LPIPS"),
+    "distributed": ("distributed", "many cases with one command (pipeline batch)"),
 }
 
 #: soname -> Debian package that brings it.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError, ReconstructionError, StageError
+from pipeline.front.log import Log
 from pipeline.front.pages import write_pages
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.runner import Reporter, Runner, RunSummary
@@ -32,9 +33,11 @@ def run(
 ) -> RunSummary:
     """Run the pipeline on photographs, reusing every result that is still valid.
 
+    ``WORKSPACE/logs`` keeps a log of each of the last runs.
+
     Args:
         images: a folder, files, a glob pattern or one video; empty to take the `views` that the
-            workspace holds as they are.
+            workspace holds as they are, with the settings of its last run unless a preset is named.
         workspace: where results are kept; default ``./runs/<name of the input>``.
         preset: name or YAML file of a preset.
         overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.
@@ -54,14 +57,36 @@ def run(
         RequestError: the request is wrong. ReconstructionError: the data can't be reconstructed.
         StageError: a fault of ours.
     """
-    request = make_request(images, workspace, preset, overrides, stages, from_stage)
+    request = make_request(
+        images, workspace, preset, overrides, stages, from_stage, as_before=True
+    )  # fmt: skip
     config = load_config(request.preset, request.overrides)
     reporter = reporter or Reporter()
+    if request.taken_over:
+        reporter.message(
+            f"As in the last run of this workspace: {' '.join(request.taken_over)} "
+            "(-c dentalsplat starts from the defaults instead)."
+        )
+    log = None if dry_run else Log(request, reporter)
+    reporter = log or reporter
     runner = Runner(request, config, reporter, verify=verify, profile=profile)
     if dry_run:
         return runner.dry_run(force=force)
     with kept_for(share_for(request.workspace, share)):
-        return _run(runner, request.workspace, config, reporter, force)
+        return _logged(log, lambda: _run(runner, request.workspace, config, reporter, force))
+
+
+def _logged(log: Log | None, work: Callable[[], RunSummary]) -> RunSummary:
+    """Do it, and write into the log how it ends."""
+    if log is None:
+        return work()
+    try:
+        summary = work()
+    except BaseException as error:
+        log.failed(error)
+        raise
+    log.done()
+    return summary
 
 
 def _run(

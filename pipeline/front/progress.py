@@ -6,7 +6,7 @@ import sys
 import time
 from typing import Any, TextIO
 
-from pipeline.runner import Figure, Reporter
+from pipeline.runner import Figure, Reporter, StageOutcome
 
 
 def describe(figures: dict[str, Any]) -> str:
@@ -16,6 +16,36 @@ def describe(figures: dict[str, Any]) -> str:
         shown = f"{value:.4g}" if isinstance(value, float) else f"{value}"
         parts.append(f"{name.replace('_', ' ')} {shown}")
     return ", ".join(parts)
+
+
+def in_words(seconds: float) -> str:
+    """``12 s``, ``3 min``."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def cost(stages: list[StageOutcome]) -> str:
+    """What a run takes from before and what it computes, with the time that this took last.
+
+    Empty where nothing is there from before.
+    """
+    if not any(stage.action == "cached" or stage.figures for stage in stages):
+        return ""
+    parts = []
+    for action, text in (
+        ("cached", "Cached: {}"), ("would run", "To be computed: {}"),
+        ("unknown", "then, unless what they are made from stays the same: {}"),
+    ):  # fmt: skip
+        found = [stage for stage in stages if stage.action == action]
+        if found:
+            last = [stage.figures["wall_seconds"] for stage in found if stage.figures]
+            told = text.format(", ".join(stage.name for stage in found))
+            some = "" if len(last) == len(found) else f"{len(last)} of them "
+            if action != "cached" and last:
+                told += f" ({some}{in_words(sum(last))} last time)"
+            parts.append(told)
+    if all(stage.action == "cached" for stage in stages):
+        return "Cached: everything. Nothing is computed."
+    return "; ".join(parts) + "."
 
 
 class Pace:
@@ -42,14 +72,30 @@ class Pace:
 class LineReporter(Reporter):
     """Plain log lines for a file, a pipe or a batch system."""
 
-    def __init__(self, stream: TextIO | None = None, interval: float = 5.0) -> None:
+    def __init__(
+        self, stream: TextIO | None = None, interval: float = 5.0, *, verbose: bool = False
+    ) -> None:
+        """
+        Args:
+            stream: where the lines go; default standard error.
+            interval: seconds between two lines of one stage.
+            verbose: also say keys, and what each stage cost.
+        """
         self._stream = stream or sys.stderr
+        self._verbose = verbose
         self._interval = interval
         self._last = 0.0
         self._pace = Pace()
 
     def _say(self, text: str) -> None:
         print(text, file=self._stream, flush=True)
+
+    def foreseen(self, stages: list[StageOutcome]) -> None:
+        if told := cost(stages):
+            self._say(told)
+        if self._verbose:
+            for stage in stages:
+                self._say(f"  {stage.name}: {stage.action}, key {stage.key or 'not known yet'}")
 
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
         self._last = time.monotonic()
@@ -71,6 +117,9 @@ class LineReporter(Reporter):
         else:
             seconds, summary = figures["wall_seconds"], describe(figures["summary"])
             self._say(f"{stage}: done in {seconds:.1f} s{f' ({summary})' if summary else ''}")
+        if self._verbose:
+            costs = {key: value for key, value in figures.items() if key != "summary"}
+            self._say(f"  {stage}: {describe(costs)}")
 
     def message(self, text: str) -> None:
         self._say(text)
@@ -98,6 +147,10 @@ class LiveReporter(Reporter):
 
     def start(self, stages: list[str]) -> None:
         self._display.start()
+
+    def foreseen(self, stages: list[StageOutcome]) -> None:
+        if told := cost(stages):
+            self._console.print(told, style="dim", markup=False)
 
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
         from rich.markup import escape
@@ -134,8 +187,10 @@ class LiveReporter(Reporter):
         self._display.stop()
 
 
-def make_reporter(quiet: bool = False) -> Reporter:
-    """The reporter that suits standard error."""
+def make_reporter(quiet: bool = False, verbose: bool = False) -> Reporter:
+    """The reporter that suits standard error; where it is to be verbose, lines that stay."""
     if quiet:
         return Reporter()
+    if verbose:
+        return LineReporter(interval=0.5, verbose=True)
     return LiveReporter() if sys.stderr.isatty() else LineReporter()

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.front.progress import describe
+from pipeline.front.progress import cost, describe, in_words
 from pipeline.front.settings import Setting
 from pipeline.runner import RunSummary
 from pipeline.stage import Finding
@@ -93,10 +93,13 @@ def headline(summary: RunSummary) -> str:
 
 def print_dry_run(summary: RunSummary) -> None:
     """What a run would do."""
-    table = _table("stage", "", "why")
+    table = _table("stage", "", "last time", "why")
     for stage in summary.stages:
-        table.add_row(stage.name, stage.action, escape("; ".join(stage.reasons)))
+        last = in_words(stage.figures["wall_seconds"]) if stage.figures else ""
+        table.add_row(stage.name, stage.action, last, escape("; ".join(stage.reasons)))
     _console().print(table)
+    if told := cost(summary.stages):
+        _console().print(told, markup=False)
 
 
 def print_status(stages: list[StageStatus]) -> None:

@@ -13,7 +13,7 @@ from pipeline.store.places import ASIDE, is_folder, is_there
 #: What a workspace and a folder of a benchmark hold besides the folders of stages.
 _OWN = {
     LOCK, "request.json", "pages.json", "results", "report.html", "check.html", "teeth.yaml",
-    "compare", "cells", "results.json", "tables.md", "tables.csv",
+    "logs", "compare", "cells", "results.json", "tables.md", "tables.csv",
 }  # fmt: skip
 
 

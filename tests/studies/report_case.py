@@ -15,6 +15,7 @@ from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.views import HeldOut, View, Views, write_png
 from pipeline.store import Store
 from stages.evaluate.images.pictures import comparison
@@ -34,9 +35,9 @@ def camera(name: str, degrees: float, focal: float = 60.0) -> Camera:
     return Camera(name, WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
 
 
-def cameras(turn: float = 0.0, units: str = "arbitrary") -> Cameras:
+def cameras(turn: float = 0.0, scale: Scale = NO_SCALE) -> Cameras:
     return Cameras(
-        tuple(camera(f"{k:03d}", 30.0 * (k - 1) + turn * k) for k in range(3)), units=units
+        tuple(camera(f"{k:03d}", 30.0 * (k - 1) + turn * k) for k in range(3)), scale=scale
     )
 
 

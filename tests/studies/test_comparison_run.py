@@ -11,6 +11,7 @@ import pipeline
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.pointmaps import Pointmaps
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
@@ -240,7 +241,7 @@ def test_cameras_are_swapped_for_a_models_in_the_same_world(tmp_path, model):
 
     truth = true_cameras()
     named = [replace(c, name=f"{k:03d}", fx=900.0, fy=900.0) for k, c in enumerate(truth)]
-    present = Cameras(tuple(named), np.diag([2.0, 2, 2, 1]), "mm")
+    present = Cameras(tuple(named), np.diag([2.0, 2, 2, 1]), Scale("mm"))
     result = swapped(tmp_path, model, present).result("cameras")
     assert (result.units, result.input_from_world[0, 0]) == ("mm", 2)
     assert [round(c.fx, 1) for c in result.cameras] == [998.4] * 3

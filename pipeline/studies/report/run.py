@@ -135,11 +135,8 @@ def closing(case: Case) -> Iterator[Card | Fact]:
         yield Card(seconds(sum(computed)), "computing time, all stages")
     cameras = case.latest("cameras")
     if cameras is not None:
-        yield Fact(
-            "Lengths are in millimetres." if cameras.units == "mm" else
-            "Lengths have no unit: nothing can be measured in millimetres in this scene. Give a "
-            "known length (init.length) for that."
-        )  # fmt: skip
+        advice = " Give a known length (init.length) for that."
+        yield Fact(cameras.scale.text + ("" if cameras.scale.unit == "mm" else advice))
     error = case.figures().get("reprojection_error_px")
     if error is not None:
         yield Fact(

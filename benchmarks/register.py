@@ -1,0 +1,261 @@
+"""Two visits against the truth: error per tooth, coverage of the intervals, refused pairs.
+
+    python benchmarks/register.py --out DIR [--mouths 4] [--views 12] [--moved 5] [--width 512]
+    python benchmarks/register.py --out DIR --views 3 --mouths 6 [--calibrate]
+
+Mouths of our generator (`data_samples/mouths/visits.py`) in which given teeth moved by known
+amounts; each visit is photographed anew, runs through the whole pipeline, and `register` compares
+the two. A mouth whose folder is there already is not made or run again. Lengths are scaled to the
+true size, so that errors are those of the movement; what a scale by textbook teeth adds is said.
+`--calibrate` says what factor and floors of the intervals these mouths ask for, and what coverage
+each mouth gets from those of the others. After that, visits of different mouths are compared, which
+must be refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from data_samples.mouths.visits import CALM, write_visits
+from pipeline.errors import ReconstructionError
+from pipeline.geometry.similarity import robust_similarity
+from pipeline.studies.register import comparing, solving
+from pipeline.studies.register.comparing import Comparison, compare_visits
+from pipeline.studies.register.movement import to_parts, tooth_axes
+from pipeline.studies.register.visit import Visit, read_visit
+
+Array = npt.NDArray[np.float64]
+
+#: What is asked for with twelve photographs: mm, degrees.
+TARGET = (0.15, 1.5)
+#: Shift and turn among the parts.
+PARTS = (slice(0, 3), slice(3, 6))
+#: Floors of each part (mm, degrees) and factors that are tried.
+FLOORS = ((0.04, 0.06, 0.08, 0.12, 0.2, 0.3), (0.7, 1.0, 1.5, 2.0, 3.0, 4.0))
+TRIED = np.arange(1.0, 12.01, 0.25)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """One row per tooth.
+
+    Attributes:
+        moved: [T] whether it truly moved.
+        shift, turn: [T] error, mm and degrees.
+        parts, half: [T, 6] error of each part, and half of its stated 95 % interval.
+        deviation: [T, 6] that the interval was made from.
+    """
+
+    moved: npt.NDArray[np.bool_]
+    shift: Array
+    turn: Array
+    parts: Array
+    half: Array
+    deviation: Array
+
+    def covered(self, half: Array) -> npt.NDArray[np.bool_]:
+        """[T] whether shift and turn are both off by no more than intervals [T, 6] say."""
+        shift = self.shift <= np.linalg.norm(half[:, :3], axis=1)
+        return np.asarray(shift & (self.turn <= np.linalg.norm(half[:, 3:], axis=1)))
+
+
+class Truth:
+    """What teeth truly did, at the points that the first visit's run puts them at."""
+
+    def __init__(self, visit: Visit, truth: dict[str, Any]) -> None:
+        self.motions = truth["motions"]
+        cameras = truth["visits"]["a"]
+        self.points = {
+            n: true_point(
+                c, n, visit, cameras, np.array(truth["centres_a"].get(str(n), np.zeros(3)))
+            )
+            for n, c in visit.centres.items()
+        }
+        numbers = sorted(self.points)
+        found = np.array([visit.centres[n] for n in numbers])
+        true = np.array([self.points[n] for n in numbers])
+        self.scale, self.rotation, _ = robust_similarity(found, true, np.ones(len(numbers)))
+
+    def displacement(self, number: int) -> Array:
+        """[6] in the frame of the first visit's run, but true mm, and rotation vector (rad)."""
+        motion = np.array(self.motions.get(str(number), np.eye(4)))
+        true = solving.displacement(motion, self.points[number])
+        return np.concatenate([self.rotation.T @ true[:3], self.rotation.T @ true[3:]])
+
+
+def true_point(
+    centre: Array, number: int, visit: Visit, cameras: dict[str, Any], near: Array
+) -> Array:
+    """[3] where the rays of the true cameras through a crown's middle meet, in the true mouth.
+
+    With one photograph, the point of the ray that is next to the true middle `near` [3].
+    """
+    matrix = 1e-3 * np.eye(3)
+    vector = matrix @ near
+    for look in visit.looks:
+        if not (look.labels == number).any():
+            continue
+        pixel, _ = look.camera.project(centre[None])
+        true = cameras[look.camera.name]
+        x, y = pixel[0] * true["width"] / look.camera.width
+        pose = np.array(true["cam_from_world"])
+        ray = pose[:3, :3].T @ [(x - true["cx"]) / true["fx"], (y - true["cy"]) / true["fy"], 1.0]
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        matrix += across
+        vector += across @ (-pose[:3, :3].T @ pose[:3, 3])
+    return np.asarray(np.linalg.solve(matrix, vector))
+
+
+def errors_of(found: Comparison, truth: dict[str, Any]) -> Errors:
+    """Compare what came out with the truth."""
+    known = Truth(found.first, truth)
+    axes = tooth_axes(found.first.centres)
+    size = np.repeat([known.scale, 1.0], 3)
+    off, half, deviation, moved = [], [], [], []
+    for tooth in found.teeth:
+        true = to_parts(axes[tooth.tooth]) @ known.displacement(tooth.tooth)
+        off.append(size * tooth.parts - true)
+        half.append(size * tooth.half)
+        deviation.append(size * tooth.deviation)
+        moved.append(str(tooth.tooth) in truth["motions"])
+    parts = np.array(off)
+    return Errors(
+        np.array(moved), np.linalg.norm(parts[:, :3], axis=1),
+        np.linalg.norm(parts[:, 3:], axis=1), parts, np.array(half),
+        np.array(deviation),
+    )  # fmt: skip
+
+
+def make(out: Path, seed: int, views: int, moved: int, width: int) -> Path:
+    """Photograph and run both visits of a mouth; what is there is kept."""
+    folder = out / f"mouth{seed}_{views}_{moved}"
+    if not (folder / "truth.json").exists():
+        write_visits(folder, seed, views, moved, width, plain=True, **CALM)
+    for name in "ab":
+        work = folder / f"run_{name}"
+        if not (work / "results").exists():
+            program = "from dentalsplat.command import main; main()"
+            command = [sys.executable, "-c", program, "run", str(folder / name), "-w", str(work)]
+            with (folder / f"run_{name}.log").open("w") as log:
+                subprocess.run(command, check=False, stdout=log, stderr=log)
+    return folder
+
+
+def line(name: str, errors: Errors, which: npt.NDArray[np.bool_]) -> str:
+    """A row of the table."""
+    if not which.any():
+        return f"{name:<24} none"
+    shift, turn = errors.shift[which], errors.turn[which]
+    inside = np.abs(errors.parts[which]) <= errors.half[which]
+    covered = errors.covered(errors.half)[which]
+    far, wide = (np.linalg.norm(errors.half[which][:, k], axis=1) for k in PARTS)
+    good = (shift <= TARGET[0]) & (turn <= TARGET[1])
+    return (
+        f"{name:<24}{which.sum():4d} teeth  mm {np.median(shift):.3f} median "
+        f"{np.quantile(shift, 0.9):.3f} p90 {shift.max():.3f} max  degrees {np.median(turn):.2f} "
+        f"{np.quantile(turn, 0.9):.2f} {turn.max():.2f}  within target {100 * good.mean():.0f} %  "
+        f"covered {covered.sum()}/{len(covered)}  parts {100 * inside.mean():.1f} %  "
+        f"interval mm {np.median(far):.2f} degrees {np.median(wide):.1f}"
+    )
+
+
+def calibrated(errors: Errors) -> tuple[float, tuple[float, float]]:
+    """Factor and floors that cover 95 % of the teeth, and of those that moved, most tightly."""
+    best: tuple[float, float, tuple[float, float]] | None = None
+    for floor in product(*FLOORS):
+        factor = 0.0
+        for some in (errors.moved, ~errors.moved):
+            if not some.any():
+                continue
+            each = np.full(int(some.sum()), np.inf)
+            for k in range(len(TRIED) - 1, -1, -1):
+                half = comparing.halves(errors.deviation, TRIED[k], floor)
+                each[errors.covered(half)[some]] = TRIED[k]
+            factor = max(factor, float(np.quantile(each, 0.95, method="higher")))
+        half = comparing.halves(errors.deviation, min(factor, TRIED[-1]), floor)
+        size = sum(float(np.log(np.linalg.norm(half[:, k], axis=1)).mean()) for k in PARTS)
+        if np.isfinite(factor) and (best is None or size < best[0]):
+            best = size, factor, floor
+    if best is None:
+        raise ValueError(f"no factor up to {TRIED[-1]} covers 95 % of the teeth")
+    return best[1:]
+
+
+def calibrate(found: list[Errors]) -> None:
+    """Say what the mouths ask for together, and how each fares with what the others ask for."""
+    factor, floor = calibrated(together(found))
+    print(f"calibrated on all: factor {factor:g}, floors {floor[0]:g} mm, {floor[1]:g} degrees")
+    counts = np.zeros(4, int)
+    for k, errors in enumerate(found if len(found) > 1 else []):
+        others = calibrated(together(found[:k] + found[k + 1 :]))
+        good = errors.covered(comparing.halves(errors.deviation, *others))
+        counts += [
+            good[errors.moved].sum(), errors.moved.sum(), good[~errors.moved].sum(),
+            (~errors.moved).sum(),
+        ]  # fmt: skip
+        print(f"  without mouth {k + 1}: {others}; it is covered {good.sum()}/{len(good)}")
+    print("left out one by one: moved {}/{} covered, others {}/{}".format(*counts))
+
+
+def together(many: list[Errors]) -> Errors:
+    """All teeth of several mouths."""
+    return Errors(*(np.concatenate([getattr(e, k) for e in many]) for k in Errors.__annotations__))
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--mouths", type=int, default=4)
+    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--moved", type=int, default=5, help="teeth that move; 0: none")
+    parser.add_argument("--width", type=int, default=512)
+    parser.add_argument("--calibrate", action="store_true", help="what intervals ought to be")
+    parser.add_argument("--no-pairs", action="store_true", help="leave different mouths out")
+    chosen = parser.parse_args()
+    visits: dict[int, tuple[Visit, Visit]] = {}
+    found: list[Errors] = []
+    for seed in range(1, chosen.mouths + 1):
+        folder = make(chosen.out, seed, chosen.views, chosen.moved, chosen.width)
+        truth = json.loads((folder / "truth.json").read_text())
+        try:
+            visits[seed] = read_visit(folder / "run_a"), read_visit(folder / "run_b")
+            compared = compare_visits(*visits[seed])
+        except (ReconstructionError, ValueError) as error:
+            print(f"mouth {seed}: {error}")
+            continue
+        errors = errors_of(compared, truth)
+        found.append(errors)
+        print(line(f"mouth {seed}, moved", errors, errors.moved))
+        print(line(f"mouth {seed}, not moved", errors, ~errors.moved), flush=True)
+        print(f"  likeness {compared.likeness:.3f}, in place {compared.share:.2f}", flush=True)
+    if found:
+        total = together(found)
+        print(line("all moved", total, total.moved))
+        print(line("all not moved", total, ~total.moved))
+        if chosen.calibrate:
+            calibrate(found)
+    if chosen.no_pairs:
+        return
+    for first, second in permutations(visits, 2):
+        try:
+            compared = compare_visits(visits[first][0], visits[second][1])
+            print(f"{first} with {second}: TAKEN, likeness {compared.likeness:.3f}")
+        except ReconstructionError as error:
+            print(f"{first} with {second}: refused: {str(error)[:160]}", flush=True)
+    print(f"thresholds: likeness {comparing.LEAST_LIKENESS}, share {comparing.LEAST_SHARE}")
+
+
+if __name__ == "__main__":
+    main()

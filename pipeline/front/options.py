@@ -1,0 +1,101 @@
+"""Options that several commands have, and what their texts mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+
+from pipeline.errors import RequestError, nearest
+from pipeline.front import completion
+from pipeline.process.privacy import SHARES, Share
+
+Word = TypeVar("Word", bound=str)
+
+Images = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="A folder, files, a quoted glob pattern, or one video.", show_default=False
+    ),
+]
+Workspace = Annotated[
+    Path | None,
+    typer.Option("-w", "--workspace", help="Where results are kept.  [default: ./runs/<input>]"),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "-c",
+        "--config",
+        autocompletion=completion.preset,
+        help="A preset's name, or a YAML file.",
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        autocompletion=completion.setting,
+        help="stage.key=value, as in fit.iterations=500. May be repeated.",
+    ),
+]
+Stages = Annotated[
+    str | None,
+    typer.Option(
+        "--stages",
+        autocompletion=completion.stages,
+        help="Only these, in this order: init,sap,fit.",
+    ),
+]
+Verify = Annotated[
+    bool,
+    typer.Option("--verify", help="Read every byte of the cached results again."),
+]
+Sharing = Annotated[
+    str | None,
+    typer.Option(
+        "--share", metavar="[nobody|group]", show_default=False,
+        help="Who else may read what is written.  [default: as the workspace is, first nobody]",
+    ),
+]  # fmt: skip
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but errors.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def names(stages: str | None) -> list[str] | None:
+    """Names with commas between them."""
+    if stages is None:
+        return None
+    return [name.strip() for name in stages.split(",") if name.strip()]
+
+
+def sharing(text: str | None) -> Share | None:
+    """For whom the results are, as the user says it."""
+    return None if text is None else one_of("--share", text, SHARES)
+
+
+def one_of(option: str, text: str, allowed: Sequence[Word]) -> Word:
+    """A value that may be one of some words.
+
+    Raises:
+        RequestError: it is another.
+    """
+    for word in allowed:
+        if text == word:
+            return word
+    raise RequestError(
+        f"{option} {text}: it may be {' or '.join(allowed)}.{nearest(text, allowed)}"
+    )
+
+
+def only_workspace() -> Path:
+    """The workspace to speak of where none is named: this folder, or the only one under runs/."""
+    if Path("request.json").exists():
+        return Path()
+    found = sorted(path.parent for path in Path("runs").glob("*/request.json"))
+    if len(found) == 1:
+        return found[0]
+    some = f" ({', '.join(map(str, found[:5]))})" if found else ""
+    raise RequestError(f"Say which workspace: -w FOLDER{some}.")

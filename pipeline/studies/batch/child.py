@@ -1,0 +1,195 @@
+"""One case in a process of its own: ``python -m`` of this module, a job on standard input.
+
+What takes too much memory or crashes is one line of the summary, not the end of the batch. The
+store keeps what the stages computed, so a case whose process was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError, ReconstructionError, RequestError
+from pipeline.files import canonical_json, sha256_file, sha256_text
+from pipeline.front.commands import run
+from pipeline.front.progress import LineReporter
+from pipeline.measure import peak_mb_with_children
+from pipeline.process.privacy import kept_for, private_from_now_on
+from pipeline.runner import Reporter, RunSummary
+from pipeline.store import is_disk_full
+from pipeline.store.locks import lock_of
+from pipeline.store.places import is_there, size_of
+from pipeline.studies.batch.keep import clear_kept, keep_results, write_thumbnail
+from pipeline.studies.batch.records import FINAL, Case, new_record, read_case, write_case
+from pipeline.untrusted.names import readable
+
+#: What the summary links to, where it is there: name -> place in a case's folder.
+LINKS = {
+    "viewer": "results/viewer.html", "report": "report.html", "check": "check.html",
+    "results": "results",
+}  # fmt: skip
+#: Exit status of a process that could not write because the disk is full.
+DISK_FULL = 74
+
+
+def main() -> None:
+    """Run the job that stands in the first line of standard input."""
+    job: dict[str, Any] = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(OSError):  # where memory runs out, this goes and not the worker
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    private_from_now_on()
+    try:
+        with kept_for(job["share"]):
+            run_case(job)
+    except Exception as error:
+        if is_disk_full(error, Path(job["out"])):
+            sys.exit(DISK_FULL)
+        raise
+
+
+def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str, Any]:
+    """Bring one case to its record, and return that.
+
+    Another process that works on the same case is waited for; what it finds is taken.
+    """
+    case, out = Case.from_dict(job["case"]), Path(job["out"])
+    workspace = out / "cases" / case.id
+    workspace.mkdir(parents=True, exist_ok=True)
+    with lock_of(workspace):
+        before = read_case(out, case.id)
+        record = new_record(case, "running", settings=job["settings"], session=job["session"])
+        record["contents"], trouble = _contents(case)
+        if before is not None and not (job["again"] and before["session"] != job["session"]):
+            same = all(before[k] == record[k] for k in ("settings", "contents"))
+            if before["state"] in FINAL and same and trouble is None:
+                record = {**before, "files": case.stamps, "name": case.name}
+                record = _trimmed(record, job, workspace)
+                write_case(out, record)
+                return record
+        attempts = before["attempts"] if before and before["session"] == job["session"] else 0
+        record |= {"attempts": attempts + 1, "host": socket.gethostname()}
+        write_case(out, record)
+        start = time.perf_counter()
+        if trouble is None:
+            record |= _outcome(job, case, workspace, reporter or LineReporter(interval=20.0))
+        else:
+            record |= {"state": "wrong", "reason": trouble}
+        if record["state"] == "stopped":
+            write_case(out, record)
+            sys.exit(DISK_FULL)
+        record["seconds"] = round(time.perf_counter() - start, 2)
+        record["peak_memory_mb"] = round(peak_mb_with_children(), 1)
+        with contextlib.suppress(OSError):
+            write_thumbnail(workspace, out / "thumbnails" / f"{case.id}.jpg")
+        record["links"] = {
+            name: place for name, place in LINKS.items() if (workspace / place).exists()
+        }
+        record["bytes"] = size_of(workspace)
+        # First the record that it is done, then what is not needed: a kill between loses nothing.
+        write_case(out, record)
+        record = _trimmed(record, job, workspace)
+        if record["kept"]:
+            write_case(out, record)
+    return record
+
+
+def _contents(case: Case) -> tuple[list[str], str | None]:
+    """Hash of each photograph; and why one can't be read."""
+    found = []
+    for path, _, _ in case.files:
+        try:
+            found.append(sha256_file(Path(path)))
+        except OSError as error:
+            return [], f"{path} can't be read ({error.strerror or error})."
+    return sorted(found), None
+
+
+def _outcome(
+    job: dict[str, Any], case: Case, workspace: Path, reporter: Reporter
+) -> dict[str, Any]:
+    """State, reason and figures of a run."""
+    overrides = [*job["overrides"], *case.overrides, f"run.threads={job['threads']}"]
+    clear_kept(workspace)
+    try:
+        summary = run(
+            case.images, workspace=workspace, preset=job["preset"], overrides=overrides,
+            stages=job["stages"], share=job["share"], reporter=reporter,
+        )  # fmt: skip
+    except Exception as error:
+        if is_disk_full(error, workspace) or (
+            error.__cause__ is not None and is_disk_full(error.__cause__, workspace)
+        ):
+            return {"state": "stopped", "reason": str(error)}
+        return {"state": _state_of(error), "reason": _reason_of(error)}
+    return {"state": "done", **_figures(summary)}
+
+
+def _state_of(error: Exception) -> str:
+    if isinstance(error, ReconstructionError):
+        return "refused"
+    return "wrong" if isinstance(error, RequestError) else "fault"
+
+
+def _reason_of(error: Exception) -> str:
+    if isinstance(error, PipelineError):
+        return str(error)
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return readable(
+        f"A fault of ours: {type(error).__name__}: {error} ({Path(where.filename).name}, line "
+        f"{where.lineno}). Please report it."
+    )
+
+
+def _figures(summary: RunSummary) -> dict[str, Any]:
+    """What stages say of themselves under the names that all use."""
+    told: dict[str, Any] = {}
+    warnings: list[str] = []
+    for stage in summary.stages:
+        told |= stage.figures["summary"]
+        warnings += stage.warnings
+    teeth = None
+    if summary.results is not None:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            teeth = len(json.loads((summary.results / "teeth.json").read_text())["teeth"])
+    return {
+        "teeth": teeth,
+        "photographs": told.get("views_total", told.get("views")),
+        "placed": told.get("views_registered"),
+        "psnr": told.get("psnr"),
+        "ssim": told.get("ssim"),
+        "warnings": warnings,
+        "key": sha256_text(canonical_json([stage.key for stage in summary.stages])),
+    }
+
+
+def _trimmed(record: dict[str, Any], job: dict[str, Any], workspace: Path) -> dict[str, Any]:
+    """The record after what is not to be kept of a case that went well has been deleted."""
+    if job["keep"] != "results" or record["state"] != "done" or record["kept"]:
+        return record
+    if not is_there(workspace / "results") and not is_there(workspace / ".results"):
+        return {**record, "left_out": [], "kept": "all"}  # it exports nothing: all is results
+    left_out = keep_results(workspace)
+    links = {name: place for name, place in LINKS.items() if (workspace / place).exists()}
+    return {
+        **record, "kept": "results", "left_out": left_out, "links": links,
+        "bytes": size_of(workspace),
+    }  # fmt: skip
+
+
+def _end_with_parent() -> None:
+    """Standard input ends when the worker ends or is killed; the store survives this exit."""
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""What stays of a case: a picture for the summary, and with ``--keep results`` the results."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from pipeline.files import fsync_tree, temporary_beside
+from pipeline.pages.page import CHECK, REPORT
+from pipeline.stage import stage_names
+from pipeline.store.places import is_folder, is_there, remove, size_of
+from pipeline.workspace import REQUEST
+
+#: Bytes that a case may have with ``--keep results``.
+MOST_KEPT = 8_000_000
+#: What is kept first, by the end of the name; what then has no room is left out, and said. The full
+#: splats (14 MB), COLMAP's model and the points are for further computing: they come last.
+ORDER = (
+    ".txt", ".json", ".csv", REPORT, ".html", ".spz", ".sog", "mesh.ply", "mesh.glb",
+    "mesh_without_scale.glb", ".mp4", CHECK, ".glb", ".stl", ".png", "points.ply", ".ply",
+)  # fmt: skip
+#: Long side of the summary's pictures, pixels.
+THUMBNAIL = 160
+#: Files of a workspace that only runs need; the stages' folders besides.
+_WORKING = (REQUEST, "pages.json", ".lock", "profile")
+#: What is kept while it is made, and when it is whole.
+_MAKING, _MADE = ".results.part", ".results"
+
+
+def keep_results(workspace: Path) -> list[str]:
+    """Keep the results of a case within `MOST_KEPT` and the pages about it; the rest is deleted.
+
+    A kill at any moment loses nothing: call it again.
+
+    Returns:
+        Names of what was left out for its size.
+    """
+    results, making, made = (workspace / name for name in ("results", _MAKING, _MADE))
+    left_out: list[str] = []
+    if not is_there(made) and (results.is_symlink() or not is_there(results)):
+        remove(making)
+        making.mkdir()
+        left_out = _copy_within(results, workspace, making)
+        fsync_tree(making)
+        making.rename(made)
+    if is_there(made):
+        if results.is_symlink() or is_there(results):
+            remove(results)
+        made.rename(results)
+    for name in (*stage_names(), *_WORKING[:2], _WORKING[3]):
+        remove(workspace / name)
+    for page in (REPORT, CHECK):
+        if page in left_out:
+            remove(workspace / page)
+    return left_out
+
+
+def clear_kept(workspace: Path) -> None:
+    """Before a case is run anew: what an earlier run kept makes room for a link to new results."""
+    for name in (_MAKING, _MADE):
+        remove(workspace / name)
+    if is_folder(workspace / "results"):
+        remove(workspace / "results")
+
+
+def _copy_within(results: Path, workspace: Path, into: Path) -> list[str]:
+    """Copy results, most wanted first, as far as there is room; returns what was left out."""
+    entries = list(results.iterdir())
+    pages = [workspace / page for page in (REPORT, CHECK) if (workspace / page).is_file()]
+    room = MOST_KEPT
+    left_out = []
+    for entry in sorted([*entries, *pages], key=_rank):
+        size = size_of(entry)
+        if entry.is_dir() or size > room:
+            left_out.append(entry.name)
+            continue
+        room -= size
+        if entry.parent == results:
+            _copy(entry, into / entry.name)
+    return left_out
+
+
+def _rank(path: Path) -> tuple[int, str]:
+    exact = [k for k, end in enumerate(ORDER) if path.name == end]
+    ending = [k for k, end in enumerate(ORDER) if path.name.endswith(end)]
+    return min(exact or ending or [len(ORDER)]), path.name
+
+
+def _copy(source: Path, target: Path) -> None:
+    """A second name for the same bytes where the disk can, else a copy."""
+    try:
+        target.hardlink_to(source)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def write_thumbnail(workspace: Path, path: Path) -> None:
+    """Write a small JPEG of what came out, or of the first photograph; nothing where neither is."""
+    candidates = [workspace / "results" / "preview.png", *_photographs(workspace)]
+    candidates = [candidate for candidate in candidates if candidate.is_file()]
+    if not candidates:
+        return
+    import cv2
+
+    from pipeline.artifacts.views import read_png
+    from pipeline.pages.pictures import QUALITY, shrunk
+
+    for candidate in candidates:
+        with suppress(OSError, ValueError, cv2.error):
+            image = shrunk(read_png(candidate)[..., :3], THUMBNAIL)
+            ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+            if ok:
+                temporary = temporary_beside(path)
+                temporary.write_bytes(data.tobytes())
+                temporary.replace(path)
+                return
+
+
+def _photographs(workspace: Path) -> list[Path]:
+    return sorted(workspace.glob("views/*/views/images/*.png"))[:1]

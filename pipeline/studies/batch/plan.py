@@ -1,0 +1,151 @@
+"""What a batch has to do: which cases there are, and which of them are finished already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import RequestError, nearest
+from pipeline.studies.batch.find import Names, find_cases, mark_duplicates
+from pipeline.studies.batch.listing import read_cases
+from pipeline.studies.batch.records import (
+    FAILED,
+    FINAL,
+    Case,
+    is_finished,
+    new_record,
+    read_case,
+    settings_key,
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cases of a batch.
+
+    Attributes:
+        cases: all, in their order.
+        settings: id -> hash of what it is run with.
+        records: id -> what is known of it now.
+        waiting: those that are to be run.
+        retried: ids of those that are run again though they came to an end.
+        asked: what it was made from.
+    """
+
+    cases: list[Case]
+    settings: dict[str, str]
+    records: dict[str, dict[str, Any]]
+    waiting: list[Case]
+    retried: set[str]
+    asked: tuple[Any, ...]
+
+    def again(self) -> Plan:
+        """The same plan, made anew."""
+        return make_plan(*self.asked)
+
+
+def make_plan(
+    place: Path,
+    out: Path,
+    preset: str | None,
+    overrides: tuple[str, ...],
+    stages: tuple[str, ...] | None,
+    retry: Sequence[str],
+    keep: str = "workspace",
+) -> Plan:
+    """Find the cases and what is known of them; nothing is written.
+
+    Raises:
+        RequestError: a setting, the place, or a name to retry is wrong, or there is no case.
+    """
+    key_of = lru_cache(maxsize=None)(settings_key)
+    key_of(preset, overrides, stages)  # a wrong setting is refused before anything else
+    out_inside = out.resolve().is_relative_to(place.resolve())
+    if out_inside and place.is_dir():
+        raise RequestError(
+            f"The results would lie in {out}, among the cases themselves. Choose a folder outside "
+            f"{place}: -o."
+        )
+    names = Names(_earlier(out))
+    cases = find_cases(place, names) if place.is_dir() else _listed(place, names)
+    settings: dict[str, str] = {}
+    for number, case in enumerate(cases):
+        try:
+            settings[case.id] = key_of(preset, overrides + case.overrides, stages)
+        except RequestError as error:
+            cases[number] = replace(case, settled="wrong", reason=str(error))
+            settings[case.id] = ""
+    cases = mark_duplicates(cases, settings)
+    if all(case.settled == "skipped" for case in cases):
+        raise RequestError(
+            f"There is no case in {place}. It should hold a folder of photographs for each case."
+        )
+    records: dict[str, dict[str, Any]] = {}
+    waiting = []
+    retried = _retried(cases, out, retry)
+    for case in cases:
+        before = None if case.settled else read_case(out, case.id)
+        if case.settled:
+            records[case.id] = new_record(case, case.settled, case.reason)
+        elif (
+            before
+            and is_finished(before, case, settings[case.id])
+            and case.id not in retried
+            and not (keep == "results" and before["state"] == "done" and not before["kept"])
+        ):
+            records[case.id] = before
+        else:
+            records[case.id] = new_record(case, "waiting")
+            waiting.append(case)
+    asked = (place, out, preset, overrides, stages, retry, keep)
+    return Plan(cases, settings, records, waiting, retried, asked)
+
+
+def _listed(place: Path, names: Names) -> list[Case]:
+    if not place.exists():
+        near = [path.name for path in place.parent.iterdir()] if place.parent.is_dir() else []
+        raise RequestError(
+            f"There is no folder or file {place}.{nearest(place.name, near)} Give a folder that "
+            "holds a folder of photographs for each case, or a CSV file."
+        )
+    return read_cases(place, names)
+
+
+def _earlier(out: Path) -> dict[str, str]:
+    """What people call a case -> its name, from the records of earlier runs."""
+    found: dict[str, str] = {}
+    for path in sorted((out / "records").glob("*.json")):
+        record = read_case(out, path.stem)
+        if record is not None:
+            found[record["name"]] = record["id"]
+    return found
+
+
+def _retried(cases: Sequence[Case], out: Path, retry: Sequence[str]) -> set[str]:
+    """Ids of the cases that are to be run again.
+
+    Raises:
+        RequestError: there is no case of a name.
+    """
+    known: Mapping[str, str] = {name: case.id for case in cases for name in (case.name, case.id)}
+    found: set[str] = set()
+    for name in retry:
+        if name in known:
+            states: tuple[str, ...] = FINAL
+            chosen = [known[name]]
+        elif name == "failed":
+            states = FAILED
+            chosen = [case.id for case in cases]
+        else:
+            raise RequestError(
+                f"--retry {name}: there is no such case. It may be 'failed', or the name of a case "
+                f"as the summary has it.{nearest(name, known)}"
+            )
+        for case in chosen:
+            record = read_case(out, case)
+            if record is not None and record["state"] in states:
+                found.add(case)
+    return found

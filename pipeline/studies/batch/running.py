@@ -1,0 +1,313 @@
+"""Run a batch: every case that is not finished, and a summary at every moment."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from filelock import Timeout
+
+from pipeline.config import parse_override
+from pipeline.errors import RequestError
+from pipeline.files import write_json
+from pipeline.installed import library_version
+from pipeline.measure import usable_cores
+from pipeline.process.privacy import Share, kept_for, share_for
+from pipeline.store import Store
+from pipeline.store.locks import lock_of
+from pipeline.store.places import stage_folder
+from pipeline.studies.batch.cluster import check_workers, connected, require_dask, slots
+from pipeline.studies.batch.plan import Plan, make_plan
+from pipeline.studies.batch.progress import Lines, by_state
+from pipeline.studies.batch.records import FOLDERS, Case, new_record, read_case, write_case
+from pipeline.studies.batch.summary import write_summary
+from pipeline.studies.batch.task import BATCH, run_case, stop
+
+Keep = Literal["workspace", "results"]
+KEEPS: tuple[Keep, ...] = get_args(Keep)
+
+#: Seconds between two looks at how the cases stand, and between two summaries.
+TICK, SUMMARY = 0.5, 5.0
+
+
+def batch(
+    cases: str | Path,
+    *,
+    out: str | Path | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    preset: str | Path | None = None,
+    overrides: Iterable[str] | Mapping[str, Any] = (),
+    stages: Sequence[str] | None = None,
+    retry: Sequence[str] = (),
+    keep: Keep = "workspace",
+    memory: float | None = None,
+    minutes: float | None = None,
+    share: Share | None = None,
+    progress: Lines | None = None,
+) -> dict[str, Any]:
+    """Run the pipeline on many cases, each in a process of its own; finished ones stay as they are.
+
+    Args:
+        cases: a folder with a folder of photographs (or a film) for each case, or a CSV file.
+        out: folder for workspaces and summary; default ``./runs/batch_<name of the cases>``.
+        jobs: cases at a time on this machine; the cores are divided between them.
+        scheduler: address or file of a Dask scheduler, to run on its workers instead.
+        preset, overrides, stages: as `pipeline.run` has them, for all cases.
+        retry: ``failed``, or names of cases: run these again though they came to an end.
+        keep: ``results``: of a case that went well only these are kept, at most 8 MB.
+        memory: gigabytes that the processes of one case may take; None: an equal share of the
+            machine, or what a worker was given; 0: as much as there is.
+        minutes: that one case may take; None: as many as it needs.
+        share: who else may read the folder; None: as it is already.
+        progress: hears how it goes.
+
+    Returns:
+        ``{"folder", "cases": [record, ...], "counts": {state: number}, "seconds"}``.
+
+    Raises:
+        RequestError: the request is wrong, another batch works in the folder, the disk is full, or
+            the scheduler is gone.
+    """
+    require_dask()
+    pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
+    texts = tuple(f"{key}={_text(value)}" for key, value in pairs)
+    if not isinstance(overrides, Mapping):
+        texts = tuple(overrides)
+    place = Path(cases)
+    folder = Path(out) if out is not None else Path("runs") / f"batch_{place.resolve().stem}"
+    progress = progress or _Silent()
+    start = time.perf_counter()
+    named = tuple(stages) if stages else None
+    common: dict[str, Any] = {
+        "out": str(folder.absolute()), "preset": str(preset) if preset is not None else None,
+        "overrides": list(texts), "stages": list(named) if named else None, "keep": keep,
+        "memory": _memory_each(memory, jobs, scheduler), "seconds": (minutes or 0) * 60,
+        "threads": 0 if scheduler else max(1, usable_cores() // jobs),
+    }  # fmt: skip
+    plan = make_plan(place, folder, common["preset"], texts, named, retry, keep)
+    with kept_for(share_for(folder, share)), _only_one(folder.absolute()) as home:
+        plan = plan.again()  # what another batch has done meanwhile
+        session = uuid.uuid4().hex
+        found = {"id": session, "version": library_version("dentalsplat"), "cases": str(place)}
+        write_json(home / BATCH, found)
+        common |= {"share": share_for(home), "session": session, "batch": session}
+        work = _Work(plan, home, common, progress, f"Batch: {place.resolve().name}")
+        work.run(scheduler, jobs)
+    records = work.records()
+    return {
+        "folder": str(folder),
+        "cases": records,
+        "counts": dict(Counter(record["state"] for record in records)),
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+
+
+def exit_status(results: Mapping[str, Any]) -> int:
+    """0: all cases are done; 1: a fault of ours or a killed case; 3: others have no scene."""
+    counts = results["counts"]
+    if any(counts.get(state) for state in ("fault", "killed", "stopped", "running", "waiting")):
+        return 1
+    return 3 if counts.get("refused") or counts.get("wrong") else 0
+
+
+class _Work:
+    """The cases of a batch on their way to the end."""
+
+    def __init__(
+        self, plan: Plan, home: Path, common: dict[str, Any], progress: Lines, title: str
+    ) -> None:
+        self._plan, self._home, self._common = plan, home, common
+        self._progress, self._title = progress, title
+        self._records = dict(plan.records)
+        self._left = {case.id for case in plan.waiting}
+        self._written = 0.0
+        self._seen: dict[str, int] = {}
+        #: Cases that are given out, by the keys of their tasks; a task whose future nobody holds
+        #: is cancelled.
+        self._cases: dict[str, Case] = {}
+        self._futures: dict[str, Any] = {}
+
+    def records(self) -> list[dict[str, Any]]:
+        """All cases in their order."""
+        return [self._records[case.id] for case in self._plan.cases]
+
+    def run(self, scheduler: str | None, jobs: int) -> None:
+        """Bring all to an end; the summary is written whatever happens."""
+        total = len(self._plan.waiting)
+        finished = sum(record["state"] == "done" for record in self._records.values())
+        if finished:
+            self._progress.message(f"{finished} of {len(self._records)} cases are done already")
+        for record in self._records.values():
+            if record["state"] in ("skipped", "duplicate", "wrong"):
+                self._progress.message(f"{record['name']}: {record['state']}: {record['reason']}")
+        self._summary()
+        try:
+            if total:
+                with connected(scheduler, jobs) as client:
+                    check_workers(client, self._home, self._common["batch"])
+                    self._progress.start(total)
+                    self._run(client, total, scheduler)
+        finally:
+            self._progress.stop()
+            for case in self._left:
+                if self._records[case]["state"] == "running":
+                    self._records[case] = {**self._records[case], "state": "stopped"}
+            self._summary()
+
+    def _run(self, client: Any, total: int, scheduler: str | None) -> None:
+        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        waiting = deque(self._plan.waiting)
+        try:
+            lonely = 0.0
+            while self._left:
+                self._submit(client, waiting, ended)
+                with contextlib.suppress(queue.Empty):
+                    future = ended.get(timeout=TICK)
+                    case = self._cases.pop(future.key)
+                    del self._futures[future.key]
+                    self._ended(case, future, total)
+                    continue  # all that have ended come first
+                self._look()
+                counts = Counter(record["state"] for record in self._records.values())
+                self._progress.state(counts, total - len(self._left), total)
+                if time.monotonic() - self._written > SUMMARY:
+                    self._summary()
+                if scheduler and time.monotonic() - lonely > 60 and not slots(client):
+                    lonely = time.monotonic()
+                    self._progress.message(f"Waiting: the scheduler {scheduler} has no workers.")
+        except BaseException:
+            stop(self._common["session"])
+            if scheduler and client.status == "running":
+                with contextlib.suppress(Exception):
+                    client.cancel(list(self._futures.values()))
+                    client.run(stop, self._common["session"], on_error="ignore")
+            raise
+
+    def _submit(self, client: Any, waiting: deque[Case], ended: queue.SimpleQueue[Any]) -> None:
+        """Give out as many cases as there are places for them.
+
+        No more: the scheduler would share all of them out at once, and hold the death of a worker
+        against every case in its queue; after some deaths it would give up cases never begun.
+        """
+        if not waiting or client.status != "running":
+            return
+        for _ in range(min(len(waiting), max(1, slots(client)) - len(self._futures))):
+            case = waiting.popleft()
+            job = {
+                **self._common, "case": case.to_dict(), "settings": self._plan.settings[case.id],
+                "again": case.id in self._plan.retried,
+            }  # fmt: skip
+            future = client.submit(
+                run_case, job, key=f"{case.id}-{self._common['session']}", pure=False, retries=0
+            )
+            self._cases[future.key], self._futures[future.key] = case, future
+            future.add_done_callback(ended.put)
+
+    def _ended(self, case: Case, future: Any, total: int) -> None:
+        """Take what came of a case."""
+        if future.status in ("cancelled", "lost"):
+            raise RequestError(
+                "The Dask scheduler is gone, or has cancelled the batch. Nothing that was computed "
+                "is lost: start it again and run the same command again."
+            )
+        if future.status == "error":
+            record = self._broken(case, future.exception())
+        else:
+            record = future.result()
+        if record["state"] in ("unseen", "full"):
+            raise RequestError(record["reason"])
+        self._records[case.id] = record
+        self._left.discard(case.id)
+        self._progress.case(record, total - len(self._left), total)
+
+    def _broken(self, case: Case, error: BaseException) -> dict[str, Any]:
+        """A record of a case whose task gave none."""
+        from distributed.scheduler import KilledWorker
+
+        settings = {"settings": self._plan.settings[case.id]}
+        if isinstance(error, KilledWorker):
+            why = (
+                "The workers that ran it died, again and again, as a system does where memory runs "
+                f"out. Look into logs/{case.id}.txt, and run with --retry failed."
+            )
+            record = new_record(case, "killed", why, **settings)
+        else:
+            why = f"A fault of ours on a worker: {type(error).__name__}: {error}"
+            record = new_record(case, "fault", " ".join(why.split())[:600], **settings)
+        write_case(self._home, record)
+        return record
+
+    def _look(self) -> None:
+        """Which cases have begun, from their records."""
+        for case in self._plan.waiting:
+            if case.id not in self._left:
+                continue
+            with contextlib.suppress(OSError):
+                stamp = (self._home / "records" / f"{case.id}.json").stat().st_mtime_ns
+                if self._seen.get(case.id) == stamp:
+                    continue
+                self._seen[case.id] = stamp
+                record = read_case(self._home, case.id)
+                if record is not None and record["session"] == self._common["session"]:
+                    self._records[case.id] = record
+
+    def _summary(self) -> None:
+        counts = Counter(record["state"] for record in self._records.values())
+        when = time.strftime("%Y-%m-%d %H:%M")
+        try:
+            write_summary(
+                self._home, self.records(), self._title, f"{by_state(counts)}; as of {when}."
+            )
+        except (OSError, RequestError) as error:  # a full disk: the cases say so as well
+            self._progress.message(f"The summary could not be written: {error}")
+        self._written = time.monotonic()
+
+
+class _Silent(Lines):
+    def message(self, text: str) -> None:
+        """Nobody listens."""
+
+
+def _text(value: Any) -> str:
+    import yaml
+
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=10**6)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _memory_each(gigabytes: float | None, jobs: int, scheduler: str | None) -> int:
+    """Bytes for one case; 0: no limit, or that of the worker."""
+    if gigabytes is not None:
+        return int(gigabytes * 1e9) or -1
+    if scheduler is not None:
+        return 0
+    import psutil
+
+    return int(psutil.virtual_memory().total * 0.9 / jobs)
+
+
+@contextlib.contextmanager
+def _only_one(folder: Path) -> Iterator[Path]:
+    """Make the folder and keep other batches out of it."""
+    Store(folder).create(more=FOLDERS)
+    for name in FOLDERS:
+        stage_folder(folder, name)
+    lock = lock_of(folder)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise RequestError(
+            f"Another batch is working in {folder}. Wait for it (its summary.html shows how far it "
+            "is), or choose another folder: -o."
+        ) from None
+    try:
+        yield folder
+    finally:
+        lock.release()

@@ -1,0 +1,171 @@
+"""From a workspace to DICOM files, and what reading them back says."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pydicom
+from pydicom.dataset import Dataset
+
+from pipeline.artifacts.space.scale import Scale
+from pipeline.errors import RequestError
+from pipeline.files import read_json, temporary_beside
+from pipeline.studies.dicom.identity import checked, valid_uid
+from pipeline.studies.dicom.objects import Picture, Solid, data_sets
+from pipeline.studies.dicom.written import Written
+from pipeline.workspace import is_workspace
+
+#: Surfaces whose names begin so are not as the reconstruction has them.
+_MODIFIED = ("closed", "print", "base")
+
+
+def write_all(
+    workspace: Path, folder: Path, patient: dict[str, str], views: int, unscaled: bool
+) -> Written:
+    """See `pipeline.studies.dicom.write_dicom`."""
+    said = checked(patient)
+    if not is_workspace(workspace):
+        raise RequestError(
+            f"{workspace} is not a workspace: no run has been started there. Give the folder that "
+            "'pipeline run' named, with -w."
+        )
+    results = workspace / "results"
+    scene = read_json(results / "scene.json")
+    if not isinstance(scene, dict):
+        raise RequestError(
+            f"{workspace} has no exports to write as DICOM files. Run the pipeline to its end "
+            f"first: pipeline run -w {workspace}."
+        )
+    scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
+    frame = str(scene.get("frame", {}).get("axes", ""))
+    solids, left_out = _solids(results, scale, frame, unscaled)
+    pictures = [*_preview(results), *_views(workspace, views)]
+    if not pictures and not solids:
+        raise RequestError(
+            f"{results} holds nothing that becomes a DICOM file: no preview and no mesh with a "
+            "scale. With --unscaled a mesh without one is written as well."
+        )
+    made = data_sets(pictures, solids, said)
+    problems: list[str] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, dataset in made.items():
+            _write(folder / name, dataset)
+            problems += [f"{name}: {text}" for text in read_back(folder / name, dataset)]
+    except OSError as error:
+        raise RequestError(
+            f"The DICOM files can't be written to {folder} ({error.strerror or error}). Name "
+            "another folder with -o."
+        ) from error
+    titles = {picture.name: picture.title for picture in pictures}
+    titles |= {solid.name: solid.title for solid in solids}
+    return Written(folder, titles, left_out, tuple(problems))
+
+
+def _solids(
+    results: Path, scale: Scale, frame: str, unscaled: bool
+) -> tuple[list[Solid], dict[str, str]]:
+    found, left_out = [], {}
+    for path in sorted(results.glob("*.stl")):
+        measured = scale.unit == "mm" and "without_scale" not in path.name
+        if not measured and not unscaled:
+            left_out[path.name] = (
+                "its scale is not known, and a program would take its lengths for millimetres; "
+                "--unscaled writes it all the same"
+            )
+            continue
+        modified = any(word in path.stem for word in _MODIFIED)
+        title = f"Surface from photographs, {scale.short}"[:64]
+        found.append(
+            Solid(
+                f"{path.stem}.dcm", title, path.read_bytes(), measured,
+                scale.short if measured else "no scale", frame, modified,
+            )
+        )  # fmt: skip
+    return found, left_out
+
+
+def _preview(results: Path) -> list[Picture]:
+    from pipeline.artifacts.views import read_png
+
+    path = results / "preview.png"
+    if not path.is_file():
+        return []
+    title = "Photograph, and the scene from its place and from another"
+    return [Picture("preview.dcm", title, _colours(read_png(path)))]
+
+
+def _views(workspace: Path, count: int) -> list[Picture]:
+    """The scene from places of the walk around it, as the workspace holds it."""
+    from pipeline.artifacts.space.frames import frame_of
+    from pipeline.measure import usable_cores
+    from pipeline.studies.report.reading import read_case
+    from stages.export.pictures.orbits import between
+    from stages.export.scene import assemble
+
+    case = read_case(workspace)
+    views, cameras, gaussians = (case.latest(kind) for kind in ("views", "cameras", "gaussians"))
+    if count < 1 or views is None or cameras is None or gaussians is None or not len(cameras):
+        return []
+    frame = frame_of(cameras, "auto")
+    scene = assemble(
+        views, cameras, gaussians, case.latest("points"), frame.from_world, usable_cores(),
+        lambda *said: None,
+    )  # fmt: skip
+    places = between(scene.orbit, scene.cameras, count)
+    return [
+        Picture(
+            f"view_{number:03d}.dcm", f"The scene from place {number + 1} of {len(places)}",
+            scene.picture(place),
+        )
+        for number, place in enumerate(places)
+    ]  # fmt: skip
+
+
+def _colours(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, -1)
+    return np.ascontiguousarray(pixels[..., :3], np.uint8)
+
+
+def _write(path: Path, dataset: Dataset) -> None:
+    """Whole or not at all."""
+    stream = io.BytesIO()
+    pydicom.dcmwrite(stream, dataset, enforce_file_format=True)
+    temporary = temporary_beside(path)
+    try:
+        temporary.write_bytes(stream.getvalue())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_back(path: Path, meant: Dataset) -> list[str]:
+    """What is wrong with a file that was written: nothing, as a rule.
+
+    Args:
+        path: of the file.
+        meant: what should be in it.
+    """
+    found = pydicom.dcmread(path)
+    wrong = []
+    for keyword in ("SOPInstanceUID", "SeriesInstanceUID", "StudyInstanceUID"):
+        if not valid_uid(str(found[keyword].value)):
+            wrong.append(f"{keyword} is no UID")
+    if "PixelData" in meant:
+        same = np.array_equal(
+            found.pixel_array.tobytes(), meant.PixelData[: found.pixel_array.size]
+        )
+        if not same or found.pixel_array.shape != (meant.Rows, meant.Columns, 3):
+            wrong.append("its pixels are not those that were written")
+    else:
+        length = int(found.EncapsulatedDocumentLength)
+        stl = bytes(found.EncapsulatedDocument)[:length]
+        triangles = int.from_bytes(stl[80:84], "little")
+        if stl != meant.EncapsulatedDocument[:length] or length != 84 + 50 * triangles:
+            wrong.append("its mesh is not the one that was written")
+    return wrong

@@ -1,0 +1,228 @@
+"""Two visits compared: who stood still, what the others did, how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import ReconstructionError
+from pipeline.geometry.similarity import camera_similarity
+from pipeline.studies.register import solving
+from pipeline.studies.register.estimate import Estimate, estimate
+from pipeline.studies.register.frame import first_frame
+from pipeline.studies.register.geometry import inverted, refined_frame
+from pipeline.studies.register.movement import to_parts, tooth_axes
+from pipeline.studies.register.uncertainty import measured
+from pipeline.studies.register.visit import Visit, scale_of
+
+Array = npt.NDArray[np.float64]
+
+#: Half of a 95 % interval in standard deviations as the equations and jackknives give them, with
+#: fewer than six photographs and with more; and what it never falls below (mm, degrees, of each
+#: part). Chosen on generated mouths so that a tooth's shift and its turn are both covered in 95 %
+#: of the teeth, of those that moved alone as well: benchmarks/register.py --calibrate.
+FACTORS = {"few": 3.0, "many": 3.0}
+FLOORS = {"few": (0.1, 3.0), "many": (0.08, 2.0)}
+MANY = 6
+#: Visits are one patient's if crowns' surroundings correlate by this at least (see `likeness`).
+LEAST_LIKENESS = 0.8
+#: And if so many teeth, and such a share of them, agree with one frame.
+LEAST_TEETH, LEAST_SHARE = 5, 0.5
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What one tooth did.
+
+    Attributes:
+        tooth: FDI.
+        parts: [6] `movement.PARTS`: mm and degrees.
+        deviation: [6] standard deviation of each as the equations and jackknives give it.
+        half: [6] half of the 95 % interval of each.
+        distance, angle: length of the shift (mm) and of the turn (degrees), with their halves of
+            the interval.
+        certain: it moved: at least one part lies beyond its interval, with room for there being
+            six of them.
+        still: it belongs to the teeth that everything is measured against.
+        at: [3] the point whose shift is given: the middle of what is seen of the crown at the first
+            visit, in its frame, mm.
+        motion: [4, 4] of the tooth in that frame.
+        displacement: [6] shift (mm) and rotation vector (rad) there.
+        spots: that it was measured by.
+        photographs: of the second visit that show them.
+    """
+
+    tooth: int
+    parts: Array
+    deviation: Array
+    half: Array
+    distance: tuple[float, float]
+    angle: tuple[float, float]
+    certain: bool
+    still: bool
+    at: Array
+    motion: Array
+    displacement: Array
+    spots: int
+    photographs: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two visits of a patient.
+
+    Attributes:
+        first, second: the visits.
+        first_from_second: [4, 4] similarity of their frames, by the teeth that stood still.
+        teeth: what could be measured, by number.
+        missing: teeth that only one of the visits shows well enough.
+        likeness, share, residual: what the decision that it is one patient stands on: median
+            correlation of crowns' surroundings; share of the teeth that agree with one frame;
+            median distance of crown from crown, mm.
+        scale_percent: standard deviation of all lengths together, percent; scale_source: whose.
+        relative_scale: size of the second run's millimetre in the first's.
+    """
+
+    first: Visit
+    second: Visit
+    first_from_second: Array
+    teeth: tuple[Moved, ...]
+    missing: tuple[int, ...]
+    likeness: float
+    share: float
+    residual: float
+    scale_percent: float
+    scale_source: str
+    relative_scale: float
+
+    @property
+    def still(self) -> list[int]:
+        """Numbers of the teeth that everything is measured against."""
+        return [tooth.tooth for tooth in self.teeth if tooth.still]
+
+
+def compare_visits(first: Visit, second: Visit) -> Comparison:
+    """Bring two visits into one frame and measure what the teeth did.
+
+    Raises:
+        ReconstructionError: they are of two patients, or share too few teeth.
+    """
+    frame, agreeing = _frame(first, second)
+    if second.scale_percent < first.scale_percent:  # the surer millimetre counts for both
+        first = first.in_frame(np.diag([1 / scale_of(frame)] * 3 + [1.0]))
+        frame, agreeing = _frame(first, second)
+    share = len(agreeing) / len(set(first.centres) & set(second.centres))
+    frame = refined_frame(first, second, frame, agreeing)
+    there = estimate(first, second, frame, agreeing)
+    back = estimate(second, first, inverted(frame), agreeing)
+    likeness = min(there.likeness, back.likeness)
+    if likeness < LEAST_LIKENESS or share < LEAST_SHARE:
+        raise ReconstructionError(
+            f"'{first.name}' and '{second.name}' do not look like two visits of one patient: "
+            f"{len(agreeing)} of the teeth that both have stand in the same places "
+            f"({100 * share:.0f} %, at least {100 * LEAST_SHARE:.0f} % are needed), and laid over "
+            f"each other the crowns' surfaces agree with a correlation of {likeness:.2f} (at least "
+            f"{LEAST_LIKENESS} is needed). Nothing was written. If they are of one patient, look "
+            "at check.html of both workspaces: a wrong tooth number is the usual cause."
+        )
+    factor = "many" if min(len(first.looks), len(second.looks)) >= MANY else "few"
+    teeth = tuple(_teeth(first, there, _mirrored(back, there), factor))
+    both = set(first.centres) ^ set(second.centres)
+    missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
+    looks = np.array([look.camera.cam_from_world for look in second.looks])
+    placed = np.array([camera.cam_from_world for camera in there.state.cameras])
+    joint = frame
+    if len(looks) > 1:
+        lever = float(np.median([np.median(k.depth[k.labels > 0]) for k in second.looks]))
+        scale, rotation, shift = camera_similarity(looks, placed, lever)
+        joint = np.eye(4)
+        joint[:3, :3], joint[:3, 3] = scale * rotation, shift
+    surer = first if first.scale_percent <= second.scale_percent else second
+    return Comparison(
+        first, second, joint, teeth, tuple(sorted(missing)), likeness, share,
+        max(there.residual, back.residual), surer.scale_percent, surer.scale_source,
+        scale_of(joint),
+    )  # fmt: skip
+
+
+def halves(deviation: Array, factor: float, floor: tuple[float, float]) -> Array:
+    """[..., 6] half of the 95 % intervals of parts, by their deviations [..., 6]."""
+    return np.asarray(np.hypot(factor * deviation, np.repeat(floor, 3)))
+
+
+def _frame(first: Visit, second: Visit) -> tuple[Array, list[int]]:
+    try:
+        frame, agreeing = first_frame(second.centres, first.centres)
+    except ValueError as error:
+        frame, agreeing, why = np.eye(4), [], str(error)
+    else:
+        why = f"only {len(agreeing)} teeth stand in the same places"
+    if len(agreeing) < LEAST_TEETH:
+        raise ReconstructionError(
+            f"'{first.name}' and '{second.name}' can't be brought into one frame: {why}; at least "
+            f"{LEAST_TEETH} teeth that did not move are needed. Either they are of two patients, "
+            "or teeth have wrong numbers (check.html in both workspaces), or nearly all have moved."
+        )
+    return frame, agreeing
+
+
+def _mirrored(back: Estimate, there: Estimate) -> dict[int, tuple[Array, Array]]:
+    """What the way back says of each tooth, as a displacement [6] of the way there, covariance."""
+    frame = inverted(back.first_from_second)  # first_from_second of the way there
+    inverse = np.linalg.inv(frame)
+    scale = scale_of(frame)
+    turn = np.zeros((6, 6))
+    turn[:3, :3], turn[3:, 3:] = frame[:3, :3], frame[:3, :3] / scale
+    found = {}
+    for number, (displacement, covariance) in measured(back).items():
+        if number not in there.centres:
+            continue
+        centre = back.centres[number]
+        motion = solving.moved_tooth(np.eye(4), displacement, centre)
+        same = frame @ np.linalg.inv(motion) @ inverse
+        found[number] = (
+            solving.displacement(same, there.centres[number]), turn @ covariance @ turn.T
+        )  # fmt: skip
+    return found
+
+
+def _teeth(
+    first: Visit, there: Estimate, back: Mapping[int, tuple[Array, Array]], factor: str
+) -> list[Moved]:
+    """Both ways together: their mean; what they differ by adds to the doubt."""
+    axes = tooth_axes(first.centres)
+    result = []
+    for number, (forward, covariance) in sorted(measured(there).items()):
+        displacement = forward
+        if number in back:
+            other, its = back[number]
+            displacement = (forward + other) / 2
+            half = (forward - other) / 2
+            covariance = (covariance + its) / 2 + np.outer(half, half)
+        leads = to_parts(axes[number])
+        parts = leads @ displacement
+        deviation = np.sqrt(np.maximum(np.diag(leads @ covariance @ leads.T), 0))
+        interval = halves(deviation, FACTORS[factor], FLOORS[factor])
+        mine = [s for s in there.spots if s.tooth == number and len(s.points)]
+        turn = float(np.degrees(Rotation.from_rotvec(displacement[3:]).magnitude()))
+        result.append(
+            Moved(
+                number, parts, deviation, interval,
+                (float(np.linalg.norm(displacement[:3])), float(np.linalg.norm(interval[:3]))),
+                (turn, float(np.linalg.norm(interval[3:]))),
+                bool((np.abs(parts) > SIX * interval).any()), number in there.still,
+                there.centres[number], solving.moved_tooth(
+                    np.eye(4), displacement, there.centres[number]
+                ),
+                displacement, sum(len(s.points) for s in mine), len({s.second for s in mine}),
+            )
+        )  # fmt: skip
+    return result
+
+
+#: The largest of six independent deviations lies within so many 95 % intervals of one in 95 %.
+SIX = 1.35

@@ -1,0 +1,249 @@
+"""All teeth's motions from one visit to the other: match, solve, see who stood still, again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.studies.register import solving
+from pipeline.studies.register.geometry import Laid, laid_crowns
+from pipeline.studies.register.matching import (
+    Prepared,
+    Spots,
+    outlines_between,
+    pairs_of,
+    prepare,
+    spots_between,
+)
+from pipeline.studies.register.movement import tooth_axes
+from pipeline.studies.register.photometric import FITS, searched
+from pipeline.studies.register.solving import Block, Pull, State
+from pipeline.studies.register.visit import Visit, in_frame
+
+Array = npt.NDArray[np.float64]
+
+#: Rounds of matching while it is open who moved, and after.
+OPEN_ROUNDS, CLOSED_ROUNDS = 4, 3
+#: Gauss-Newton steps after each matching.
+STEPS = 2
+#: Partners of each photograph, and degrees between their directions at most.
+PARTNERS, WIDEST = 2, 14.0
+#: While it is open: how firmly a tooth is held (mm), and from how far on it is let go (mm).
+HELD, LET_GO = 0.03, 0.15
+#: A tooth stood still if it went by less than this (mm), or this many times what most do.
+STILL, TIMES = 0.1, 2.5
+#: How firmly a tooth that stood still is held, mm.
+FIRM = 0.01
+#: How far teeth move, mm, and from how far on a start by shape alone is taken.
+EXPECTED, CLEAR = 0.5, 0.3
+#: What a tooth does between two visits: 1 mm, 6 degrees (standard deviations).
+PRIOR = np.diag([1.0] * 3 + [1 / np.radians(6.0) ** 2] * 3)
+#: A tooth is measured if it has so many spots in all.
+LEAST_SPOTS = 120
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What came out of matching a visit with another.
+
+    Attributes:
+        state: motions of the first visit's teeth, and the second's cameras in its frame.
+        still: numbers of the teeth that stood still.
+        blocks: normal equations at the end.
+        spots: behind them.
+        laid: what the crowns' shapes say of their motions.
+        centres: FDI number -> [3] centre of the crown at the first visit, mm.
+        likeness: median correlation of the crowns' surroundings, at the end.
+        residual: median distance of crowns from crowns, laid onto each other, mm.
+        first_from_second: [4, 4] similarity of the two visits' frames.
+        seen: FDI number -> [4, 4] motion of a tooth that moved, by which its pictures fit better
+            than by `state` (see `photometric`).
+    """
+
+    state: State
+    still: tuple[int, ...]
+    blocks: tuple[Block, ...]
+    spots: tuple[Spots, ...]
+    laid: dict[int, Laid]
+    centres: dict[int, Array]
+    likeness: float
+    residual: float
+    first_from_second: Array
+    seen: dict[int, Array] = field(default_factory=dict)
+
+
+def estimate(
+    first: Visit, second: Visit, first_from_second: Array, agreeing: Sequence[int]
+) -> Estimate:
+    """Find the motions of the first visit's teeth.
+
+    Args:
+        first, second: visits.
+        first_from_second: [4, 4] similarity to begin with.
+        agreeing: teeth that seem to have stood still, by that similarity.
+    """
+    a = [prepare(look) for look in first.looks]
+    b = [prepare(look) for look in second.looks]
+    centres = first.centres
+    laid = calibrated(laid_crowns(first, second, first_from_second, agreeing), agreeing)
+    state = State(
+        {n: _start(laid.get(n), centres[n]) for n in centres},
+        tuple(in_frame(look.camera, first_from_second) for look in second.looks),
+    )
+    spots = match(a, b, state, outlines_between)
+    for _ in range(2 * STEPS):
+        state = _step(spots, state, centres, (), laid)
+    for _ in range(OPEN_ROUNDS):
+        spots = match(a, b, state)
+        for _ in range(STEPS):
+            state = _step(spots, state, centres, None, laid)
+    # Flow is lost where it starts too far off: such teeth get another start.
+    still = stood_still(state, centres, spots)
+    better = searched(a, b, state, still, centres, tooth_axes(centres), PARTNERS, WIDEST)
+    started = {n: fit.motion for n, fit in better.items() if n not in still or fit.score >= FITS}
+    state = replace(state, motions={**state.motions, **started})
+    factor = 1.0
+    for _ in range(CLOSED_ROUNDS):
+        still = stood_still(state, centres, spots)
+        spots = [replace(s, information=s.information * factor) for s in match(a, b, state)]
+        for _ in range(STEPS):
+            state = _step(spots, state, centres, still, laid)
+        factor /= noise(spots, state, centres, still)
+    blocks = [solving.block_of(s, state, centres[s.tooth]) for s in spots]
+    seen = searched(a, b, state, still, centres, None, PARTNERS, WIDEST)
+    likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
+    residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
+    return Estimate(
+        state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
+        first_from_second, {n: fit.motion for n, fit in seen.items() if n not in still},
+    )  # fmt: skip
+
+
+def calibrated(laid: dict[int, Laid], agreeing: Sequence[int]) -> dict[int, Laid]:
+    """Shapes are as sure as those of teeth that (mostly) stood still turn out to be."""
+    sizes = [
+        laid[n].displacement @ laid[n].information @ laid[n].displacement / 6
+        for n in agreeing
+        if n in laid
+    ]
+    factor = max(float(np.quantile(sizes, 0.9)), 1.0) if sizes else 1.0
+    return {n: replace(crown, information=crown.information / factor) for n, crown in laid.items()}
+
+
+def _start(laid: Laid | None, centre: Array) -> Array:
+    """[4, 4] a tooth's motion by its shape alone, where that says clearly that it moved."""
+    if laid is None:
+        return np.eye(4)
+    prior = np.diag([1.0] * 3 + [solving.LEVER**2] * 3) / EXPECTED**2
+    goal = laid.information @ laid.displacement
+    likely = np.asarray(np.linalg.solve(laid.information + prior, goal), np.float64)
+    if solving.travel(likely) < CLEAR:
+        return np.eye(4)
+    return solving.moved_tooth(np.eye(4), likely, centre)
+
+
+def match(
+    a: Sequence[Prepared], b: Sequence[Prepared], state: State,
+    between: Callable[..., list[Spots]] = spots_between,
+) -> list[Spots]:  # fmt: skip
+    """The spots of all pairs of photographs."""
+    found: list[Spots] = []
+    pairs = pairs_of([p.look.camera for p in a], list(state.cameras), PARTNERS, WIDEST)
+    for i, j in pairs:
+        found += between(a[i], b[j], state.cameras[j], state.motions, i, j)
+    total: dict[int, int] = {}
+    for spots in found:
+        total[spots.tooth] = total.get(spots.tooth, 0) + len(spots.points)
+    least = 0 if between is outlines_between else LEAST_SPOTS
+    return [s for s in found if total[s.tooth] >= least]
+
+
+def held(travel: float, firm: float | None) -> Array:
+    """[6, 6] information that holds a tooth: loosely and robustly, or by `firm` mm."""
+    loose = HELD * (1 + (travel / LET_GO) ** 2)
+    weight = 1 / (loose if firm is None else firm) ** 2
+    lever = solving.LEVER**2
+    return np.diag([weight] * 3 + [weight * lever] * 3)
+
+
+def pulls(
+    drift: dict[int, Array], still: Sequence[int] | None, laid: dict[int, Laid]
+) -> list[Pull]:
+    """What holds the teeth: those that stood still firmly, the others by their shape."""
+    zero = np.zeros(6)
+    found = []
+    for n, d in drift.items():
+        if still is not None and n in still:
+            found.append(Pull(n, held(0.0, FIRM), zero))
+            continue
+        found.append(Pull(n, PRIOR, zero))
+        if still is None:
+            found.append(Pull(n, held(solving.travel(d), None), zero))
+        if n in laid:
+            found.append(Pull(n, laid[n].information, laid[n].displacement))
+    return found
+
+
+def _step(
+    spots: Sequence[Spots], state: State, centres: dict[int, Array],
+    still: Sequence[int] | None, laid: dict[int, Laid],
+) -> State:  # fmt: skip
+    """One Gauss-Newton step of everything. `still`: None while it is open who stood still."""
+    used = [s for s in spots if len(s.points)]
+    blocks = [solving.block_of(s, state, centres[s.tooth]) for s in used]
+    teeth = sorted({s.tooth for s in used})
+    drift = {n: solving.displacement(state.motions[n], centres[n]) for n in teeth}
+    system = solving.system_of(blocks, len(state.cameras))
+    change, _ = solving.solved(
+        system, system.matrices.sum(0), system.vectors.sum(0), pulls(drift, still, laid), drift
+    )
+    cameras = change[solving.TOOTH * len(teeth) :].reshape(-1, solving.CAMERA)
+    motions = dict(state.motions)
+    for n in teeth:
+        motions[n] = solving.moved_tooth(motions[n], change[system.place(n)], centres[n])
+    return State(
+        motions,
+        tuple(solving.moved_view(c, v) for c, v in zip(state.cameras, cameras, strict=True)),
+    )
+
+
+def noise(
+    spots: Sequence[Spots], state: State, centres: dict[int, Array], still: Sequence[int]
+) -> float:
+    """By what factor spots are less sure than they say, by the teeth that stood still.
+
+    Each is let go by itself: what it would do then is noise.
+    """
+    sizes = []
+    for n in still:
+        mine = [solving.block_of(s, state, centres[n]) for s in spots if s.tooth == n]
+        matrix = sum((b.matrix[:6, :6] for b in mine), 1e-9 * np.eye(6))
+        change = np.linalg.solve(matrix, sum((b.vector[:6] for b in mine), np.zeros(6)))
+        sizes.append(float(change @ matrix @ change) / 6)
+    return max(float(np.median(sizes)), 1e-3) if sizes else 1.0
+
+
+def stood_still(state: State, centres: dict[int, Array], spots: Sequence[Spots]) -> tuple[int, ...]:
+    """The teeth whose motion is no more than what most teeth's is, by noise alone."""
+    measured = sorted({s.tooth for s in spots if len(s.points)})
+    travel = {
+        n: solving.travel(solving.displacement(state.motions[n], centres[n])) for n in measured
+    }
+    if not travel:
+        return ()
+    values = np.sort(list(travel.values()))
+    lower = values[: max(3, len(values) // 2)]
+    limit = max(STILL, TIMES * float(np.median(lower)))
+    return tuple(n for n in measured if travel[n] <= limit)
+
+
+def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
+    """The value at which half of the weight is reached; -1 for no values."""
+    if not len(values):
+        return -1.0
+    order = np.argsort(values)
+    total = np.cumsum(np.asarray(weights, np.float64)[order])
+    return float(np.asarray(values)[order][np.searchsorted(total, total[-1] / 2)])

@@ -1,0 +1,245 @@
+"""Which of several motions of a tooth makes its photographs agree best.
+
+Optical flow finds the nearest motion that explains a picture, and on a smooth crown a wrong one may
+do. So the motion of a tooth is improved on the contrast of its pictures itself, and where that fits
+badly it is tried from several turns and shifts; the correlation over all pairs of photographs
+chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.studies.register import solving
+from pipeline.studies.register.matching import Prepared, Spots, pairs_of
+from pipeline.studies.register.solving import State
+from pipeline.studies.register.visit import Floats
+
+Array = npt.NDArray[np.float64]
+
+#: Turns to begin with, degrees about the tooth's axes: tip, torque, rotation.
+STARTS = (
+    (0, 0, 0), (0, 0, 8), (0, 0, -8), (6, 0, 0), (-6, 0, 0), (0, 8, 0), (0, -8, 0),
+)  # fmt: skip
+#: Shifts to begin with along the arch and out of the gum, mm; so many of the best are followed.
+SHIFTS, BEST_SHIFTS = (-1.4, -0.7, 0.0, 0.7, 1.4), 3
+#: A crown whose picture correlates by this fits; another motion is clearly better by so much.
+FITS, CLEARLY = 0.6, 0.05
+#: Blur of the pictures, pixels of one 512 wide, and steps with each.
+COARSE_TO_FINE = ((2.0, 6), (1.0, 5))
+FINE = len(COARSE_TO_FINE) - 1
+#: Points of a crown in each pair, and how few are too few.
+POINTS, LEAST, PAIRS = 250, 40, 12
+#: So many points side by side say the same: contrast reaches over several pixels.
+ALIKE = 10.0
+#: What a tooth does between two visits: 1 mm, 6 degrees (standard deviations).
+PRIOR = np.diag([1.0] * 3 + [1 / np.radians(6.0) ** 2] * 3)
+
+
+@dataclass(frozen=True)
+class Facing:
+    """A crown in a pair of photographs.
+
+    Attributes:
+        points: [N, 3] of the first visit's crown, mm.
+        values: per blur, [N] contrast in the first photograph, mean 0 and deviation 1.
+        pictures: per blur, [H, W, 3] contrast of the second photograph and its derivatives.
+        crown: [H, W] 1 where the second photograph shows the crown, 0 beside it.
+        clear: [H, W] 1 well inside it and without highlights.
+        camera: of the second photograph.
+    """
+
+    points: Array
+    values: tuple[Array, ...]
+    pictures: tuple[Floats, ...]
+    crown: Floats
+    clear: Floats
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A motion [4, 4], the correlation it gives (-1..1), and how sure it is ([6, 6])."""
+
+    motion: Array
+    score: float
+    information: Array
+
+
+class Pictures:
+    """Blurred contrast of a visit's photographs, made once."""
+
+    def __init__(self, prepared: Sequence[Prepared]) -> None:
+        self.prepared = prepared
+        self.made = []
+        for p in prepared:
+            scale = max(p.contrast.shape) / 512
+            image = p.contrast.astype(np.float32) - 128
+            levels = []
+            for sigma, _ in COARSE_TO_FINE:
+                soft = cv2.GaussianBlur(image, (0, 0), sigma * scale)
+                dx = cv2.Scharr(soft, cv2.CV_32F, 1, 0) / 32
+                dy = cv2.Scharr(soft, cv2.CV_32F, 0, 1) / 32
+                levels.append(np.dstack([soft, dx, dy]))
+            self.made.append(tuple(levels))
+
+
+def facings(
+    tooth: int, a: Pictures, b: Pictures, state: State, pairs: Sequence[tuple[int, int]]
+) -> list[Facing]:
+    """The crown in all pairs of photographs that show it."""
+    found, sizes = [], []
+    motion = state.motions[tooth]
+    for i, j in pairs:
+        one, other, camera = a.prepared[i], b.prepared[j], state.cameras[j]
+        crown = one.core == tooth
+        if crown.sum() < LEAST:
+            continue
+        points = one.look.points[crown]
+        pixels, z = camera.project(points @ motion[:3, :3].T + motion[:3, 3])
+        column, row = np.floor(pixels).astype(int).T
+        inside = (
+            (z > 1) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        )
+        names = other.look.labels[row[inside], column[inside]]
+        if (names > 0).sum() < LEAST:
+            continue
+        theirs = (other.look.labels == np.bincount(names[names > 0]).argmax()).astype(np.float32)
+        near = cv2.dilate(theirs, np.ones((5, 5), np.uint8)) > 0
+        kept = np.flatnonzero(inside)[near[row[inside], column[inside]]]
+        if len(kept) < max(LEAST, 0.3 * len(points)):
+            continue
+        kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), POINTS)).astype(int)]
+        clear = ((other.core > 0) & (theirs > 0)).astype(np.float32)
+        values = tuple(level[..., 0][crown][kept].astype(np.float64) for level in a.made[i])
+        found.append(Facing(points[kept], values, b.made[j], theirs, clear, camera))
+        sizes.append(int(crown.sum()))
+    return [found[k] for k in np.argsort(sizes, kind="stable")[::-1][:PAIRS]]
+
+
+def _sampled(facing: Facing, level: int, motion: Array) -> tuple[Array, Array, Array, Array]:
+    """Pixels [N, 2], contrast and derivatives [N, 3], [N] on the crown, [N] clear."""
+    pixels, z = facing.camera.project(facing.points @ motion[:3, :3].T + motion[:3, 3])
+    x, y = np.where(z > 1, pixels.T - 0.5, -9).astype(np.float32)[:, None]
+    value = cv2.remap(facing.pictures[level], x, y, cv2.INTER_LINEAR)[0]
+    crown = cv2.remap(facing.crown, x, y, cv2.INTER_LINEAR)[0]
+    clear = cv2.remap(facing.clear, x, y, cv2.INTER_LINEAR)[0] > 0.5
+    return pixels, value.astype(np.float64), crown, clear
+
+
+def score(views: Sequence[Facing], level: int, motion: Array) -> float:
+    """Correlation over all pairs, weighted by points; points beside the crown count as misses."""
+    total = weight = 0.0
+    for facing in views:
+        _, value, crown, clear = _sampled(facing, level, motion)
+        if clear.sum() < LEAST / 2:
+            continue
+        x, y = facing.values[level][clear], value[clear, 0]
+        x, y = x - x.mean(), y - y.mean()
+        likeness = float(x @ y / np.sqrt(max(x @ x, 1e-6) * max(y @ y, 1e-6)))
+        total += len(crown) * (likeness * float(crown.mean()))
+        weight += len(crown)
+    return total / weight if weight else -1.0
+
+
+def improved(views: Sequence[Facing], start: Array, centre: Array) -> Fit:
+    """Improve a motion by Gauss-Newton steps on the contrast itself."""
+    motion, information = start, np.eye(6)
+    for level, (_, steps) in enumerate(COARSE_TO_FINE):
+        for _ in range(steps):
+            matrix, vector = np.zeros((6, 6)), np.zeros(6)
+            for facing in views:
+                pixels, value, _, clear = _sampled(facing, level, motion)
+                if clear.sum() < LEAST / 2:
+                    continue
+                x, y = facing.values[level][clear], value[clear, 0]
+                x = (x - x.mean()) / max(float(x.std()), 1.0)
+                size = max(float(y.std()), 1.0)
+                off = x - (y - y.mean()) / size
+                slope = value[clear, 1:] / size
+                steep = (slope**2).sum(1)
+                noise = max(float(np.mean(off**2)), 0.05) * ALIKE
+                some = Spots(
+                    0, 0, 0, facing.points[clear],
+                    pixels[clear] + slope * (off / np.maximum(steep, 1e-6))[:, None],
+                    slope[:, :, None] * slope[:, None, :] / noise, 0.0, 0,
+                )  # fmt: skip
+                block = solving.block_of(some, State({0: motion}, (facing.camera,)), centre)
+                matrix += block.matrix[:6, :6]
+                vector += block.vector[:6]
+            information = matrix
+            drift = solving.displacement(motion, centre)
+            change = np.linalg.solve(matrix + PRIOR, vector - PRIOR @ drift)
+            motion = solving.moved_tooth(motion, change, centre)
+            if solving.travel(change) < 2e-3:
+                break
+    return Fit(motion, score(views, FINE, motion), information)
+
+
+def best_motion(views: Sequence[Facing], now: Array, centre: Array, axes: Array) -> Fit:
+    """The best of the motions that several starts lead to.
+
+    Args:
+        views: of the tooth.
+        now: [4, 4] the motion to begin with.
+        centre: [3] of the tooth as it was. axes: [3, 3] of it (see `movement.tooth_axes`).
+    """
+    mesial, buccal, own = axes
+
+    def turned(start: Array, tip: float, torque: float, rotation: float) -> Array:
+        turn = np.radians(tip * buccal + torque * mesial + rotation * own)
+        change = np.concatenate([np.zeros(3), turn])
+        return solving.moved_tooth(start, change, centre)
+
+    starts = [turned(now, *angles) for angles in STARTS]
+    shifted: list[tuple[float, int, Array]] = []
+    for along in SHIFTS:
+        for up in SHIFTS:
+            start = now.copy()
+            start[:3, 3] += along * mesial + up * own
+            shifted.append((score(views, 0, start), len(shifted), start))
+    starts += [start for _, _, start in sorted(shifted, key=lambda s: -s[0])[:BEST_SHIFTS]]
+    return max((improved(views, start, centre) for start in starts), key=lambda fit: fit.score)
+
+
+def searched(
+    first: Sequence[Prepared], second: Sequence[Prepared], state: State, still: Sequence[int],
+    centres: Mapping[int, Array], axes: Mapping[int, Array] | None, partners: int, widest: float,
+) -> dict[int, Fit]:  # fmt: skip
+    """FDI number -> a better motion, for teeth whose pictures fit better with one.
+
+    Args:
+        first, second: photographs of both visits.
+        state: motions to begin with, and the second visit's cameras, which stay.
+        still: teeth that seem to have stood still: these need a bad fit to be tried at all, and
+            other starts must fit clearly better.
+        centres: of all teeth. axes: of all teeth (see `movement.tooth_axes`), to try other starts;
+            None: motions are only improved.
+        partners, widest: which photographs are compared (`matching.pairs_of`).
+    """
+    a, b = Pictures(first), Pictures(second)
+    pairs = pairs_of([p.look.camera for p in first], list(state.cameras), partners, widest)
+    found = {}
+    for tooth in sorted(state.motions):
+        views = facings(tooth, a, b, state, pairs)
+        if not views:
+            continue
+        now = state.motions[tooth]
+        fits = score(views, FINE, now)
+        if tooth in still and (fits >= FITS or axes is None):
+            continue
+        best = improved(views, now, centres[tooth])
+        # Another start has to be clearly better than the nearest motion, or a bad fit is traded
+        # for another one.
+        if axes is not None and best.score < FITS:
+            other = best_motion(views, now, centres[tooth], axes[tooth])
+            best = other if other.score > best.score + CLEARLY else best
+        if best.score > fits + (CLEARLY if tooth in still else 0.0):
+            found[tooth] = best
+    return found

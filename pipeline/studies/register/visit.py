@@ -1,0 +1,246 @@
+"""A finished run as a visit: its photographs, cameras in millimetres, and teeth in 3D."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.gaussians import Gaussians
+from pipeline.errors import RequestError
+from pipeline.geometry.similarity import moved_camera
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Labels = npt.NDArray[np.uint8]
+
+#: Where the scene is more transparent than this it has no depth.
+LEAST_ALPHA = 0.5
+#: A tooth is known in 3D from this many pixels on.
+LEAST_PIXELS = 40
+#: Share of a tooth's points, by depth, that may be off: what outlines take in beside the tooth.
+TRIMMED = 0.04
+
+
+@dataclass(frozen=True)
+class Look:
+    """One photograph of a visit.
+
+    Attributes:
+        camera: in the frame of its visit, mm.
+        image: [H, W] float32 grey, 0..1.
+        labels: [H, W] uint8 FDI number of the crown at each pixel, 0: none.
+        depth: [H, W] float32 z of the scene, mm; 0 where it is not known.
+        valid: [H, W] bool, where the photograph may be used.
+    """
+
+    camera: Camera
+    image: Floats
+    labels: Labels
+    depth: Floats
+    valid: npt.NDArray[np.bool_]
+
+    @cached_property
+    def points(self) -> Array:
+        """[H, W, 3] what each pixel sees, mm; meaningless where depth is 0."""
+        return self.camera.unproject(self.depth)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A visit.
+
+    Attributes:
+        name: for messages.
+        looks: photographs with cameras and teeth, in the order of the run.
+        teeth: FDI number -> [N, 3] points of its crown, mm.
+        scale_percent: relative standard deviation of its millimetres, percent.
+        scale_source: where millimetres come from, in words.
+        gaussians: the scene, in the run's own world; None in tests.
+        frame: [4, 4] similarity from that world to this frame.
+    """
+
+    name: str
+    looks: tuple[Look, ...]
+    teeth: Mapping[int, Array]
+    scale_percent: float = 0.0
+    scale_source: str = ""
+    gaussians: Gaussians | None = None
+    frame: Array = field(default_factory=lambda: np.eye(4))
+
+    def in_frame(self, frame: Array) -> Visit:
+        """The visit in a frame that a similarity [4, 4] leads to."""
+        scale = scale_of(frame)
+        return replace(
+            self,
+            looks=tuple(
+                replace(
+                    look, camera=in_frame(look.camera, frame),
+                    depth=(look.depth * scale).astype(np.float32),
+                ) for look in self.looks
+            ),
+            teeth={n: p @ frame[:3, :3].T + frame[:3, 3] for n, p in self.teeth.items()},
+            frame=frame @ self.frame,
+        )  # fmt: skip
+
+    @cached_property
+    def centres(self) -> dict[int, Array]:
+        """FDI number -> [3] middle of what is seen of the crown, mm."""
+        return {number: np.median(points, axis=0) for number, points in self.teeth.items()}
+
+
+def read_visit(workspace: Path) -> Visit:
+    """Read a finished run.
+
+    Raises:
+        RequestError: no run, an unfinished one, or one without teeth.
+    """
+    from pipeline.studies.report.reading import read_case
+    from stages.splatting.rendering import render
+
+    case = read_case(workspace)
+    if case.failed is not None:
+        raise RequestError(
+            f"{workspace}: the run ended in {case.failed.name} and has no scene to compare. "
+            f"'pipeline status -w {workspace}' says why."
+        )
+    views, cameras, gaussians, teeth = (
+        case.latest(kind) for kind in ("views", "cameras", "gaussians", "teeth")
+    )
+    for made, stage in ((views, "views"), (teeth, "teeth"), (cameras, "init"), (gaussians, "fit")):
+        if made is None:
+            raise RequestError(
+                f"{workspace} holds no result of the stage '{stage}': finish the run first "
+                f"(pipeline run -w {workspace})."
+            )
+    frame = np.asarray(cameras.input_from_world, np.float64)
+    read, by_name = teeth.by_name(), views.by_name()
+    looks = []
+    for camera in cameras.cameras:
+        dentition = read.get(camera.name)
+        view = by_name.get(camera.name)
+        if dentition is None or view is None or dentition.set_aside:
+            continue
+        rendered = render(gaussians, camera)
+        known = (rendered.alpha >= LEAST_ALPHA) & (rendered.depth > 0)
+        looks.append(
+            Look(
+                camera, cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), labels_of(dentition, view),
+                np.where(known, rendered.depth, 0).astype(np.float32), view.valid(),
+            )
+        )  # fmt: skip
+    points = teeth_points(looks)
+    if len(points) < 2:
+        raise RequestError(
+            f"{workspace}: no numbered teeth were found in the photographs that were placed; "
+            "visits are compared by their teeth."
+        )
+    percent, source = cameras.scale.uncertainty_percent, SOURCES.get(cameras.scale.source, "")
+    if cameras.scale.unit != "mm":
+        middles = {n: np.median(p, axis=0) for n, p in points.items()}
+        frame = np.diag([textbook_scale(middles)] * 3 + [1.0])
+        percent, source = 100 * TEXTBOOK_DEVIATION, SOURCES["textbook_teeth"]
+    made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians)
+    made = made.in_frame(frame)
+    return replace(made, scale_percent=float(percent or 0.0), scale_source=source)
+
+
+#: Where a run's millimetres come from, in words, by `Scale.source`.
+SOURCES = {
+    "length": "a given length",
+    "cameras": "the cameras that were given",
+    "tooth_widths": "widths of teeth that were given",
+    "textbook_teeth": "textbook teeth",
+    "none": "the run, which does not say from where",
+}
+#: Relative standard deviation of a size that textbook teeth say.
+TEXTBOOK_DEVIATION = 0.08
+
+
+def textbook_scale(centres: Mapping[int, Array]) -> float:
+    """Millimetres per unit, if neighbouring crowns are as far apart as the textbook's.
+
+    Args:
+        centres: FDI number -> [3] centre of the crown, in any unit.
+
+    Raises:
+        RequestError: no two neighbours.
+    """
+    from pipeline.artifacts.dental.fdi import is_primary, is_upper, permanent_of, teeth_of
+    from stages.init.dental.template import PRIMARY_WIDTHS, WIDTHS
+
+    def width(number: int) -> float:
+        table = PRIMARY_WIDTHS if is_primary(number) else WIDTHS
+        row = table["upper" if is_upper(number) else "lower"]
+        return row[min(number % 10, len(row)) - 1]
+
+    places = {permanent_of(n): n for n in centres}
+    ratios = []
+    for jaw in ("upper", "lower"):
+        order = teeth_of(jaw)
+        for one, next_ in pairwise(order):
+            if one in places and next_ in places:
+                a, b = places[one], places[next_]
+                apart = float(np.linalg.norm(centres[a] - centres[b]))
+                ratios.append((width(a) + width(b)) / 2 / max(apart, 1e-9))
+    if not ratios:
+        raise RequestError(
+            "no two neighbouring teeth are known, so nothing says how large they are"
+        )
+    return float(np.median(ratios))
+
+
+def scale_of(frame: Array) -> float:
+    """Millimetres per unit of a similarity [4, 4]."""
+    return float(np.cbrt(np.linalg.det(frame[:3, :3])))
+
+
+def in_frame(camera: Camera, frame: Array) -> Camera:
+    """The camera in a frame that a similarity [4, 4] leads to; depths scale with it."""
+    scale = scale_of(frame)
+    pose = moved_camera(camera.cam_from_world, scale, frame[:3, :3] / scale, frame[:3, 3])
+    return replace(camera, cam_from_world=pose)
+
+
+def labels_of(dentition, view) -> Labels:  # type: ignore[no-untyped-def]
+    """[H, W] FDI number of each pixel of a view, by the outlines of its numbered crowns."""
+    from pipeline.artifacts.teeth import filled
+    from stages.export.teeth import exported_outline
+
+    labels = np.zeros((view.height, view.width), np.uint8)
+    size = view.width, view.height
+    for crown in dentition.all_crowns:
+        if crown.number and len(crown.outline) >= 3:
+            outline = exported_outline(crown.outline, dentition.size, view)
+            labels[filled((replace(crown, outline=outline),), size)] = crown.number
+    return labels
+
+
+def teeth_points(looks: list[Look] | tuple[Look, ...]) -> dict[int, Array]:
+    """FDI number -> [N, 3] points inside its outlines of all photographs, without stray ones."""
+    found: dict[int, list[Array]] = {}
+    for look in looks:
+        for number in (int(n) for n in np.unique(look.labels) if n):
+            inner = cv2.erode((look.labels == number).astype(np.uint8), np.ones((3, 3), np.uint8))
+            inside = (inner > 0) & (look.depth > 0)
+            if inside.sum() >= LEAST_PIXELS:
+                found.setdefault(number, []).append(look.points[inside])
+    teeth = {}
+    for number, parts in sorted(found.items()):
+        # A photograph that gave the number to another tooth, or none, is outvoted.
+        middles = np.array([np.median(part, axis=0) for part in parts])
+        middle = np.median(middles, axis=0)
+        kept = [p for p, m in zip(parts, middles, strict=True) if np.linalg.norm(m - middle) < 5]
+        if not kept:
+            continue
+        points = np.concatenate(kept)
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        teeth[number] = points[away <= np.quantile(away, 1 - TRIMMED)]
+    return teeth

@@ -1,0 +1,249 @@
+"""Batches of toy cases: what runs, what is not run again, what is said, and what a kill leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.artifacts import KINDS
+from pipeline.errors import RequestError
+from pipeline.stage import get_stage
+from tests.studies import toy_batch
+
+pytest.importorskip("distributed")
+
+PRESET = f"stages: {toy_batch.ORDER}\nreport: false\n"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Run a batch of toys on ``cases`` and return its records by name."""
+    from pipeline.studies.batch import task
+    from pipeline.studies.batch.running import batch
+
+    monkeypatch.setitem(KINDS, "numbers", "toy:Numbers")
+    monkeypatch.setattr("pipeline.stage._entry_points", lambda: toy_batch.STAGES)
+    monkeypatch.setattr(task, "COMMAND", (*toy_batch.COMMAND, "child"))
+    monkeypatch.setenv("TOY_LOG", str(tmp_path / "log.txt"))
+    get_stage.cache_clear()
+    (tmp_path / "toy.yaml").write_text(PRESET)
+
+    def call(cases: str = "cases", **options: Any) -> dict[str, Any]:
+        (tmp_path / "log.txt").write_text("")
+        given = {"preset": tmp_path / "toy.yaml", "jobs": 2, **options}
+        found = batch(tmp_path / cases, out=tmp_path / "out", **given)
+        return {record["name"]: record for record in found["cases"]}
+
+    yield call
+    get_stage.cache_clear()
+
+
+def add_case(folder: Path, name: str, *values: int) -> Path:
+    case = folder / "cases" / name
+    case.mkdir(parents=True)
+    for value in values:
+        (case / f"{value}.jpg").write_text(str(value))
+    return case
+
+
+def listed(folder: Path, **settings: str) -> None:
+    """A list of cases, each with two photographs of its own and these settings."""
+    lines = ["name,photographs,settings"]
+    for number, (name, setting) in enumerate(settings.items()):
+        add_case(folder, name, 10 * number, 10 * number + 1)
+        lines.append(f"{name},cases/{name},{setting}")
+    (folder / "cases.csv").write_text("\n".join(lines) + "\n")
+
+
+def computed(folder: Path) -> Counter[str]:
+    lines = (folder / "log.txt").read_text().splitlines()
+    return Counter(json.loads(line)[0] for line in lines)
+
+
+def test_cases_are_run_once_and_seen_again(run: Any, tmp_path: Path) -> None:
+    add_case(tmp_path, "a", 1, 2)
+    add_case(tmp_path, "clinic/b", 3, 4, 5)
+    add_case(tmp_path, "clinic/like a", 1, 2)
+    add_case(tmp_path, "empty")
+    found = run()
+    states = {name: record["state"] for name, record in found.items()}
+    assert states == {
+        "a": "done", "clinic/b": "done", "clinic/like a": "duplicate", "empty": "wrong",
+    }  # fmt: skip
+    assert computed(tmp_path) == {"views": 2, "fit": 2, "export": 2}
+    one = found["clinic/b"]
+    assert (one["teeth"], one["placed"], one["photographs"], one["psnr"]) == (3, 3, 3, 33.0)
+    assert one["seconds"] > 0 and one["peak_memory_mb"] > 10
+    assert found["clinic/like a"]["like"] == "a"
+    with (tmp_path / "out" / "summary.csv").open() as stream:
+        rows = {row["name"]: row for row in csv.DictReader(stream)}
+    assert rows["clinic/b"]["viewer"] == "cases/clinic__b/results/viewer.html"
+    assert (tmp_path / "out" / rows["clinic/b"]["viewer"]).is_file()
+    assert "empty" in rows["empty"]["reason"]
+    again = run()
+    assert computed(tmp_path) == {}
+    assert again == found
+    # A changed photograph and a changed setting are noticed; a file that was only touched is not.
+    (tmp_path / "cases" / "a" / "1.jpg").write_text("7")
+    os.utime(tmp_path / "cases" / "clinic" / "b" / "3.jpg", ns=(1, 1))
+    assert run()["clinic/like a"]["state"] == "done"  # not like `a` any more
+    assert computed(tmp_path) == {"views": 2, "fit": 2, "export": 2}
+    run(overrides=["fit.megabytes=1"])
+    assert computed(tmp_path) == {"fit": 3}  # what it exports has the same bytes
+
+
+def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> None:
+    listed(
+        tmp_path, good="", none="fit.fail=refused", bug="fit.fail=fault", dies="fit.fail=killed",
+        odd="fit.fial=1", big="fit.megabytes=500; fit.wait=20",
+    )  # fmt: skip
+    found = run("cases.csv", memory=0.4)
+    states = {name: record["state"] for name, record in found.items()}
+    assert states == {
+        "good": "done", "none": "refused", "bug": "fault", "dies": "killed", "odd": "wrong",
+        "big": "killed",
+    }  # fmt: skip
+    assert "share nothing" in found["none"]["reason"]
+    assert "ZeroDivisionError" in found["bug"]["reason"]
+    assert "fit.fail" in found["odd"]["reason"]  # the setting that was meant
+    assert "more memory" in found["big"]["reason"] and "--memory" in found["big"]["reason"]
+    assert found["dies"]["attempts"] == 3 and "3 times" in found["dies"]["reason"]
+    assert computed(tmp_path)["views"] == 5  # the store had it for the second try
+    again = run("cases.csv", memory=0.4)
+    assert computed(tmp_path) == {} and again == found
+    run("cases.csv", memory=0.4, retry=["bug"])
+    assert computed(tmp_path) == {"fit": 1}
+    with pytest.raises(
+        RequestError, match=r"--retry gud: there is no such case.*Did you mean 'good"
+    ):
+        run("cases.csv", retry=["gud"])
+
+
+def test_a_case_may_take_so_much_time_and_is_tried_again_when_asked(
+    run: Any, tmp_path: Path
+) -> None:
+    listed(tmp_path, slow="fit.wait=60")
+    found = run("cases.csv", minutes=0.01)
+    assert found["slow"]["state"] == "killed" and "more time" in found["slow"]["reason"]
+    text = (tmp_path / "cases.csv").read_text().replace("=60", "=0")  # no result depends on it
+    (tmp_path / "cases.csv").write_text(text)
+    assert run("cases.csv") == found and computed(tmp_path) == {}
+    assert run("cases.csv", retry=["failed"])["slow"]["state"] == "done"
+
+
+def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:
+    add_case(tmp_path, "a", 1, 2)
+    place = tmp_path / "out" / "cases" / "a"
+    record = run()["a"]
+    assert (place / "results" / "splats.ply").is_file() and record["bytes"] > 9_000_000
+    record = run(keep="results")["a"]  # what was made before is trimmed, not made again
+    assert computed(tmp_path) == {}
+    assert record["kept"] == "results" and record["bytes"] < 8_000_000
+    assert set(record["left_out"]) == {"splats.ply", "colmap"}
+    assert (place / "results" / "viewer.html").read_text() == "<p>a scene"
+    assert not (place / "fit").exists()
+    assert run(keep="results")["a"] == record and computed(tmp_path) == {}
+    run(retry=["a"])  # asked for anew, with all of it
+    assert (place / "results" / "splats.ply").is_file() and computed(tmp_path)["views"] == 1
+
+
+def test_a_full_disk_ends_the_batch_and_it_goes_on(run: Any, tmp_path: Path) -> None:
+    listed(tmp_path, a="", b="fit.fail=full")
+    with pytest.raises(RequestError, match=r"is full.*run the same command again"):
+        run("cases.csv", jobs=1)
+    text = (tmp_path / "cases.csv").read_text().replace("fit.fail=full", "")
+    (tmp_path / "cases.csv").write_text(text)
+    states = [record["state"] for record in run("cases.csv").values()]
+    assert states == ["done", "done"]
+    assert computed(tmp_path) == {"fit": 1, "export": 1}
+
+
+def test_wrong_requests_are_refused_before_anything_is_written(run: Any, tmp_path: Path) -> None:
+    from filelock import FileLock
+
+    case = add_case(tmp_path, "a", 1, 2)
+    for change, text in (
+        ({"cases": "case"}, "Did you mean 'cases'"),
+        ({"cases": "cases/a"}, "is one case: pipeline run"),
+        ({"overrides": ["fit.fial=1"]}, r"fit\.fail"),
+        ({"scheduler": "nowhere.json"}, "neither an address"),
+        ({"scheduler": str(case / "1.jpg")}, "names no address"),
+    ):
+        with pytest.raises(RequestError, match=text):
+            run(**change)
+    with pytest.raises(RequestError, match="among the cases"):
+        from pipeline.studies.batch.running import batch
+
+        batch(tmp_path / "cases", out=case / "out", preset=tmp_path / "toy.yaml")
+    (tmp_path / "out").mkdir(exist_ok=True)
+    with FileLock(tmp_path / "out" / ".lock"), pytest.raises(RequestError, match="Another batch"):
+        run()
+
+
+# -- the command line, killed ----------------------------------------------------------------------
+
+
+def command(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    (folder / "toy.yaml").write_text(PRESET)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [*toy_batch.COMMAND, "batch", "cases", "-o", "out", "-c", "toy.yaml", *arguments],
+            cwd=folder, env={**os.environ, "TOY_LOG": str(folder / "log.txt")}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def wait_for(condition: Callable[[], Any]) -> None:
+    for _ in range(3000):
+        if condition():
+            return
+        time.sleep(0.02)
+    raise AssertionError("this never came to pass")
+
+
+def fitting(folder: Path) -> list[int]:
+    """Processes in which a fit has begun."""
+    lines = (folder / "log.txt").read_text().splitlines() if (folder / "log.txt").exists() else []
+    return [entry[2] for entry in map(json.loads, lines) if entry[0] == "fit"]
+
+
+def alive(process: int) -> bool:
+    try:
+        return "child" in Path(f"/proc/{process}/cmdline").read_text()
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_interrupted_or_killed_it_leaves_no_orphan_and_goes_on(
+    tmp_path: Path, how: int, status: int
+) -> None:
+    for name in ("a", "b", "c"):
+        add_case(tmp_path, name, *(ord(name) + k for k in range(2)))
+    slow = command(tmp_path, "--set", "fit.wait=60", "--jobs", "2")
+    wait_for(lambda: len(fitting(tmp_path)) == 2)
+    children = fitting(tmp_path)
+    assert all(map(alive, children))
+    slow.send_signal(how)
+    _, told = slow.communicate(timeout=30)
+    assert slow.returncode == status, told
+    wait_for(lambda: not any(map(alive, children)))
+    (tmp_path / "log.txt").write_text("")
+    again = command(tmp_path, "--json")
+    out, told = again.communicate(timeout=60)
+    assert again.returncode == 0, told
+    assert json.loads(out)["counts"] == {"done": 3}
+    assert computed(tmp_path) == {"views": 1, "fit": 3, "export": 3}

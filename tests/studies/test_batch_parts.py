@@ -1,0 +1,150 @@
+"""Names of cases, folders and lists of them, and the summary: also of names that mean harm."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import RequestError
+from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
+from pipeline.studies.batch.listing import read_cases
+from pipeline.studies.batch.records import Case, new_record
+from pipeline.studies.batch.summary import csv_text, write_summary
+
+HOSTILE = (
+    "../../etc", "a/b", "a__b", "A__B", "con", "<script>alert(1)</script>", "ü", ".",
+    "x" * 300, "a b", "a_b", "%2e%2e", "'\"&#", "\N{TOOTH}", "-rf", "NUL.txt", "",
+)  # fmt: skip
+
+
+def pictures(folder: Path, count: int = 2) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        (folder / f"{number}.jpg").write_bytes(bytes([number]))
+    return folder
+
+
+def states(found: list[Case]) -> dict[str, str]:
+    return {case.name: case.settled for case in found}
+
+
+def test_names_are_safe_and_unique_and_stay() -> None:
+    names = Names({})
+    given = {called: names.of(called) for called in HOSTILE}
+    assert len({name.casefold() for name in given.values()}) == len(HOSTILE)
+    for name in given.values():
+        assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and len(name) < 80, name
+        assert not re.match(r"(?i)(con|nul)(\.|$)", name)
+    # A case that comes to it later takes no name away, whatever the order.
+    later = Names(given)
+    assert {called: later.of(called) for called in reversed(HOSTILE)} == given
+    assert later.of("A B").casefold() not in {name.casefold() for name in given.values()}
+
+
+def test_what_lies_in_a_folder_of_cases(tmp_path: Path) -> None:
+    pictures(tmp_path / "a")
+    pictures(tmp_path / "clinic" / "2024" / "b")
+    pictures(tmp_path / "c" / "images")
+    pictures(tmp_path / "both" / "more")
+    pictures(tmp_path / "both")
+    pictures(tmp_path / "masked" / "masks")
+    pictures(tmp_path / "masked")
+    pictures(tmp_path / ".hidden")
+    (tmp_path / "film").mkdir()
+    (tmp_path / "film" / "x.mp4").write_bytes(b"x")
+    (tmp_path / "films").mkdir()
+    for name in "xy":
+        (tmp_path / "films" / f"{name}.mp4").write_bytes(b"x")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "1.jpg").write_bytes(b"x")
+    (tmp_path / "text.pdf").write_text("")
+    (tmp_path / "1.jpg").write_text("")
+    (tmp_path / "a link").symlink_to("a")
+    (tmp_path / "clinic" / "up").symlink_to("..")
+    (tmp_path / "self").symlink_to("self")
+    (tmp_path / "dead").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    os.mkdir(os.fsencode(tmp_path) + b"/\xff")  # noqa: PTH102
+    found = find_cases(tmp_path, Names({}))
+    run = {"a", "clinic/2024/b", "c", "masked", "film"}
+    wrong = {"both", "films", "empty", "one", r"\xff"}
+    skipped = {".hidden", "text.pdf", "1.jpg", "a link", "clinic/up", "self", "dead", "pipe"}
+    assert states(found) == {
+        **dict.fromkeys(run, ""), **dict.fromkeys(wrong, "wrong"),
+        **dict.fromkeys(skipped, "skipped"),
+    }  # fmt: skip
+    assert all(case.reason for case in found if case.settled)
+    assert len({case.id for case in found}) == len(found)
+    reasons = {case.name: case.reason for case in found}
+    assert "which is a case already" in reasons["a link"]
+    assert "2 films" in reasons["films"] and "at least two photographs" in reasons["one"]
+
+
+def test_many_foreign_files_are_counted(tmp_path: Path) -> None:
+    pictures(tmp_path / "a")
+    for number in range(MOST_FOREIGN + 7):
+        (tmp_path / f"{number}.txt").write_text("")
+    found = find_cases(tmp_path, Names({}))
+    assert len(found) == MOST_FOREIGN + 2
+    assert any("7 more files" in case.reason for case in found)
+
+
+def test_a_list_of_cases(tmp_path: Path) -> None:
+    pictures(tmp_path / "p")
+    text = (
+        "\ufeffname;photographs;settings\r\n"
+        '"Müller; Anna";p;\r\nb;"p/0.jpg;p/1.jpg";"fit.iterations=5; fit.light=none"\r\n'
+        "b;p;\r\n;p;\r\nc;nowhere;\r\nd;;\r\ne;p;;;x\r\n"
+    )
+    (tmp_path / "list.csv").write_text(text, encoding="utf-8", newline="")
+    found = read_cases(tmp_path / "list.csv", Names({}))
+    assert states(found) == {
+        "Müller; Anna": "", "b": "", "b (line 4)": "wrong", "line 5": "wrong", "c": "wrong",
+        "d": "wrong", "e": "wrong",
+    }  # fmt: skip
+    assert found[1].overrides == ("fit.iterations=5", "fit.light=none")
+    assert [Path(path).name for path, _, _ in found[1].files] == ["0.jpg", "1.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("", "must name its columns"),
+        ("name,photos\na,b\n", "a column 'photos'; .*Did you mean 'photographs'"),
+        ("name,photographs\n", "has no cases"),
+        ("name,name,photographs\na,b,c\n", "each once"),
+        ('name,photographs\n"a,b\n', "can't be read as CSV"),
+    ],
+)
+def test_a_wrong_list_is_refused(tmp_path: Path, text: str, what: str) -> None:
+    (tmp_path / "list.csv").write_text(text)
+    with pytest.raises(RequestError, match=what):
+        read_cases(tmp_path / "list.csv", Names({}))
+    (tmp_path / "list.csv").write_bytes(b"name,photographs\n\xff\xfe,b\n")
+    with pytest.raises(RequestError, match="not text in UTF-8"):
+        read_cases(tmp_path / "list.csv", Names({}))
+
+
+def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:
+    bad = "<img src=x onerror=alert(1)>"
+    records: list[dict[str, Any]] = [
+        new_record(Case("x-1", bad), "wrong", f"=cmd {bad}\nsecond line"),
+        new_record(Case("+x", "=1+1"), "done", psnr=31.25, links={"viewer": "results/a b#.html"}),
+        *(new_record(Case(f"c{n}", f"case {n}"), "waiting") for n in range(948)),
+    ]
+    write_summary(tmp_path, records, f"Batch: {bad}", "950 cases")
+    page = (tmp_path / "summary.html").read_text()
+    assert "<img src=x" not in page and "&lt;img src=x" in page
+    assert 'href="cases/%2Bx/results/a%20b%23.html"' in page
+    assert len(page) < 1_000_000
+    rows = list(csv.DictReader(io.StringIO(csv_text(records))))
+    assert len(rows) == 950
+    assert rows[0]["reason"] == f"'=cmd {bad} second line"
+    assert (rows[1]["name"], rows[1]["psnr"]) == ("'=1+1", "31.25")

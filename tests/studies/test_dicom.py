@@ -1,0 +1,156 @@
+"""`pipeline dicom`: what the files hold, whom they name, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
+from pipeline.artifacts.views import write_png
+from pipeline.errors import RequestError
+from pipeline.studies.dicom import write_dicom
+from pipeline.workspace import Request
+from tests.personal_data import PERSONAL
+
+pydicom = pytest.importorskip("pydicom")
+writing: Any = pytest.importorskip("pipeline.studies.dicom.writing")
+
+PREVIEW = np.arange(40 * 61 * 3, dtype=np.uint32).astype(np.uint8).reshape(40, 61, 3)
+IN_MM = Scale("mm", "tooth_widths", 4.0)
+
+
+def stl(triangles: int = 3) -> bytes:
+    return b"dentalsplat".ljust(80, b"\0") + struct.pack("<I", triangles) + bytes(50 * triangles)
+
+
+def workspace(folder: Path, scale: Scale = IN_MM) -> Path:
+    """A finished run, as far as this study looks at one without views of the scene."""
+    results = folder / "results"
+    results.mkdir(parents=True)
+    Request(folder, (), None, (), None).save()
+    write_png(results / "preview.png", PREVIEW)
+    name = "mesh.stl" if scale.unit == "mm" else "mesh_without_scale.stl"
+    (results / name).write_bytes(stl())
+    scene = {"scale": scale.as_dict(), "frame": {"axes": "x left, y up, z front"}}
+    (results / "scene.json").write_text(json.dumps(scene))
+    return folder
+
+
+def read(folder: Path, name: str) -> Any:
+    return pydicom.dcmread(folder / name)
+
+
+def test_a_picture_and_a_mesh(tmp_path: Path) -> None:
+    written = write_dicom(workspace(tmp_path / "w"), views=0)
+    assert sorted(written.files) == ["mesh.dcm", "preview.dcm"] and written.problems == ()
+    assert written.folder == tmp_path / "w" / "dicom"
+    picture = read(written.folder, "preview.dcm")
+    assert picture.SOPClassUID.name == "Secondary Capture Image Storage"
+    np.testing.assert_array_equal(picture.pixel_array, PREVIEW)
+    assert (picture.BurnedInAnnotation, picture.ConversionType) == ("NO", "WSD")
+    mesh = read(written.folder, "mesh.dcm")
+    assert mesh.SOPClassUID.name == "Encapsulated STL Storage"
+    assert mesh.EncapsulatedDocument[: mesh.EncapsulatedDocumentLength] == stl()
+    assert mesh.MeasurementUnitsCodeSequence[0].CodeValue == "mm"
+    assert "4%" in mesh.ContentDescription and "tooth_widths" in mesh.DocumentTitle
+    assert picture.StudyInstanceUID == mesh.StudyInstanceUID
+    assert picture.SeriesInstanceUID != mesh.SeriesInstanceUID
+    assert picture.SOPInstanceUID != mesh.SOPInstanceUID
+
+
+def test_nobody_is_named_unless_asked(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "Prognath_Anna")
+    for name in write_dicom(folder, tmp_path / "none", views=0).files:
+        found = read(tmp_path / "none", name)
+        assert (found.PatientName, found.PatientID, found.StudyDate) == ("", "", "")
+        assert found.PatientIdentityRemoved == "YES" and found.DeidentificationMethod
+        data = (tmp_path / "none" / name).read_bytes()
+        assert not any(word.encode() in data for word in PERSONAL)
+    patient = {"PatientID": "MRN-0815", "PatientName": "Prögnath^Anna", "PatientSex": "F"}
+    write_dicom(folder, tmp_path / "anna", patient=patient, views=0)
+    found = read(tmp_path / "anna", "mesh.dcm")
+    assert (found.PatientID, str(found.PatientName)) == ("MRN-0815", "Prögnath^Anna")
+    assert found.PatientIdentityRemoved == "NO" and "DeidentificationMethod" not in found
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "w")
+    for name in ("a", "b"):
+        write_dicom(folder, tmp_path / name, views=0)
+    write_dicom(folder, tmp_path / "c", patient={"PatientID": "1"}, views=0)
+    for name in ("preview.dcm", "mesh.dcm"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+        first, other = read(tmp_path / "a", name), read(tmp_path / "c", name)
+        assert first.SOPInstanceUID != other.SOPInstanceUID, "another patient's are others"
+
+
+def test_a_study_to_join(tmp_path: Path) -> None:
+    written = write_dicom(
+        workspace(tmp_path / "w"), patient={"StudyInstanceUID": "1.2.840.99.5"}, views=0
+    )
+    found = read(written.folder, "preview.dcm")
+    assert found.StudyInstanceUID == "1.2.840.99.5" and found.PatientIdentityRemoved == "YES"
+
+
+def test_a_mesh_without_scale_is_not_written_unless_asked(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "w", NO_SCALE)
+    written = write_dicom(folder, tmp_path / "a", views=0)
+    assert sorted(written.files) == ["preview.dcm"]
+    assert "scale is not known" in written.left_out["mesh_without_scale.stl"]
+    written = write_dicom(folder, tmp_path / "b", views=0, unscaled=True)
+    found = read(tmp_path / "b", "mesh_without_scale.dcm")
+    assert found.MeasurementUnitsCodeSequence[0].CodeMeaning == "no units"
+    assert "no scale" in found.DocumentTitle
+
+
+@pytest.mark.parametrize(
+    ("patient", "said"),
+    [
+        ({"PatientBirthDate": "4.7.2019"}, "--birth-date '4.7.2019' is not what DICOM allows"),
+        ({"PatientSex": "female"}, "M, F or O"),
+        ({"PatientID": "a\\b"}, "no backslash"),
+        ({"PatientID": ""}, "--patient-id"),
+        ({"StudyInstanceUID": "1.2.x"}, "--study-uid"),
+        ({"AccessionNumber": "1" * 17}, "at most 16"),
+        ({"PatientNam": "A"}, "Did you mean 'PatientName'?"),
+    ],
+)
+def test_what_dicom_does_not_allow_is_refused(
+    tmp_path: Path, patient: dict[str, str], said: str
+) -> None:
+    folder = workspace(tmp_path / "w")
+    with pytest.raises(RequestError) as refused:
+        write_dicom(folder, patient=patient, views=0)
+    assert said in str(refused.value)
+    assert not (folder / "dicom").exists()
+
+
+def test_no_run_no_files(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="is not a workspace"):
+        write_dicom(tmp_path)
+    folder = workspace(tmp_path / "w")
+    (folder / "results" / "scene.json").unlink()
+    with pytest.raises(RequestError, match="no exports"):
+        write_dicom(folder)
+    other = workspace(tmp_path / "v")
+    (other / "dicom").write_text("in the way")
+    with pytest.raises(RequestError, match="can't be written to"):
+        write_dicom(other, views=0)
+
+
+def test_reading_back_finds_what_is_wrong(tmp_path: Path) -> None:
+    written = write_dicom(workspace(tmp_path / "w"), views=0)
+    for name, change in (("preview.dcm", {"Rows": 20}), ("mesh.dcm", {})):
+        meant, path = read(written.folder, name), written.folder / name
+        other = read(written.folder, name)
+        for keyword, value in change.items():
+            setattr(other, keyword, value)
+        if "EncapsulatedDocument" in other:
+            other.EncapsulatedDocument = stl(2) + bytes(50)
+        other.save_as(path)
+        assert writing.read_back(path, meant) != []

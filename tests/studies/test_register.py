@@ -1,0 +1,199 @@
+"""Two visits of one patient: what moved comes out, and who is somebody else is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.errors import ReconstructionError, RequestError
+from pipeline.geometry.rigid import exponential
+from pipeline.studies.register import comparing, movement, run_register, solving
+from pipeline.studies.register.comparing import compare_visits
+from pipeline.studies.register.frame import first_frame
+from pipeline.studies.register.visit import scale_of, textbook_scale
+from tests.studies.register_case import motion, toy_centres, toy_visit, write_visit
+
+MOVED = {
+    12: ((0.5, 0.2, 0.4), (3.0, -4.0, 2.0)),
+    34: ((-0.2, 0.6, 0.3), (0.0, 5.0, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def motions() -> dict[int, np.ndarray]:
+    centres = toy_centres()
+    return {n: motion(centres[n], *how) for n, how in MOVED.items()}
+
+
+@pytest.fixture(scope="module")
+def found(motions: dict[int, np.ndarray]) -> comparing.Comparison:
+    second = toy_visit("second", motions, turn=3.0)
+    frame = np.eye(4)
+    frame[:3, :3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0]
+    frame[:3, 3] = 20, -10, 5
+    return compare_visits(toy_visit("first"), second.in_frame(frame))
+
+
+def test_known_movements_come_out(found: comparing.Comparison, motions: dict) -> None:
+    """Within .1 mm and 2.5 degrees, in a frame and at a scale that nobody knows."""
+    assert len(found.teeth) >= 16
+    for tooth in found.teeth:
+        true = solving.displacement(motions.get(tooth.tooth, np.eye(4)), tooth.at)
+        off = tooth.displacement - true
+        assert np.linalg.norm(off[:3]) < 0.1, tooth.tooth
+        assert np.degrees(np.linalg.norm(off[3:])) < 2.5, tooth.tooth
+
+
+def test_intervals_hold_the_truth_and_say_who_moved(
+    found: comparing.Comparison, motions: dict
+) -> None:
+    axes = movement.tooth_axes(found.first.centres)
+    inside = []
+    for tooth in found.teeth:
+        true = solving.displacement(motions.get(tooth.tooth, np.eye(4)), tooth.at)
+        inside += list(
+            np.abs(movement.to_parts(axes[tooth.tooth]) @ true - tooth.parts) <= tooth.half
+        )
+        assert tooth.certain == (tooth.tooth in motions), tooth.tooth
+        assert tooth.still == (tooth.tooth not in motions), tooth.tooth
+    assert np.mean(inside) >= 0.95
+
+
+def test_the_scale_between_the_runs_comes_out(found: comparing.Comparison) -> None:
+    assert found.relative_scale == pytest.approx(1 / 1.07, rel=2e-3)
+    assert scale_of(found.first_from_second) == found.relative_scale
+
+
+def test_nothing_moved_says_so() -> None:
+    found = compare_visits(toy_visit("first"), toy_visit("again", turn=-4.0))
+    assert not [tooth.tooth for tooth in found.teeth if tooth.certain]
+
+
+def test_two_patients_are_refused() -> None:
+    with pytest.raises(ReconstructionError, match="one patient"):
+        compare_visits(toy_visit("anna"), toy_visit("berta", patient=2))
+
+
+def test_teeth_that_no_frame_brings_together_are_refused() -> None:
+    visit = toy_visit("anna")
+    few = {n: points for n, points in visit.teeth.items() if n in (11, 12, 13)}
+    other = type(visit)("berta", visit.looks, few)
+    with pytest.raises(ReconstructionError, match="can't be brought into one frame"):
+        compare_visits(visit, other)
+
+
+def test_first_frame_stands_up_to_teeth_that_moved() -> None:
+    centres = toy_centres()
+    turn = exponential(np.array([0, 0, 0, 0.4, 1.0, -0.3]))[0]
+    target = {n: 0.9 * turn @ c + [5, 6, 7] for n, c in centres.items()}
+    for number in (11, 12, 21, 22, 31, 32):
+        target[number] = target[number] + [0, 2.5, 0]
+    frame, agreeing = first_frame(centres, target)
+    assert set(agreeing) == set(centres) - {11, 12, 21, 22, 31, 32}
+    assert np.allclose(frame[:3, :3], 0.9 * turn, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("tooth", "way", "part"),
+    [
+        (11, (1, 0, 0), ("mesial", 1)),
+        (21, (1, 0, 0), ("mesial", -1)),
+        (11, (0, 0, 1), ("buccal", 1)),
+        (15, (-1, 0, 0), ("buccal", 1)),
+        (12, (0, -1, 0), ("extrusion", 1)),
+        (33, (0, 1, 0), ("extrusion", 1)),
+    ],
+)
+def test_directions_have_their_names(
+    tooth: int, way: tuple[float, ...], part: tuple[str, int]
+) -> None:
+    axes = movement.tooth_axes(toy_centres())[tooth]
+    parts = movement.to_parts(axes) @ np.array([*way, 0, 0, 0], float)
+    name = movement.PARTS[int(np.argmax(np.abs(parts)))]
+    assert (name, int(np.sign(parts[movement.PARTS.index(name)]))) == part
+
+
+@pytest.mark.parametrize("tooth", [12, 22, 32, 42])
+def test_turns_have_their_names(tooth: int) -> None:
+    """The same words mean the same on both sides and in both jaws."""
+    centre = toy_centres()[tooth]
+    axes = movement.tooth_axes(toy_centres())[tooth]
+    mesial, buccal, out_of_gum = axes
+    parts = movement.to_parts(axes)
+    for name, point, way in (
+        ("tip", out_of_gum, mesial), ("torque", out_of_gum, buccal), ("rotation", mesial, buccal),
+    ):  # fmt: skip
+        value = np.zeros(6)
+        value[movement.PARTS.index(name)] = 2.0
+        turn = np.linalg.solve(parts, value)[3:]
+        assert np.cross(turn, point) @ way > 0, (tooth, name)
+    assert np.allclose(parts @ np.linalg.inv(parts), np.eye(6)), centre
+
+
+def test_words_name_what_is_beyond_the_doubt() -> None:
+    half = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    said = movement.words(np.array([-0.4, 0.05, 0.2, 0.5, -3.0, 0.0]), half)
+    assert said == "0.40 mm distal, 0.20 mm extrusion, torque -3.0°"
+    assert "no movement" in movement.words(np.zeros(6), half)
+
+
+def test_axes_need_both_sides() -> None:
+    right = {n: c for n, c in toy_centres().items() if n // 10 in (1, 4)}
+    with pytest.raises(ValueError, match="both sides"):
+        movement.mouth_axes(right)
+
+
+def test_textbook_teeth_give_a_scale() -> None:
+    front = {11: np.zeros(3), 21: np.array([0, 0, 4.25]), 22: np.array([0, 3.75, 4.25])}
+    assert textbook_scale(front) == pytest.approx(2.0)
+    with pytest.raises(RequestError, match="neighbouring"):
+        textbook_scale({11: np.zeros(3), 16: np.ones(3)})
+
+
+@pytest.fixture(scope="module")
+def workspaces(tmp_path_factory: pytest.TempPathFactory, motions: dict) -> tuple[Path, Path]:
+    home = tmp_path_factory.mktemp("visits")
+    return (
+        write_visit(home / "may", toy_visit("first")),
+        write_visit(home / "june", toy_visit("second", motions, turn=3.0)),
+    )
+
+
+def test_the_command_writes_table_page_and_mesh(
+    workspaces: tuple[Path, Path], tmp_path: Path, motions: dict[int, np.ndarray]
+) -> None:
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "12: " in result.output
+    said = json.loads((out / "register.json").read_text())
+    assert {t["fdi"] for t in said["teeth"] if t["moved"]} == set(MOVED)
+    with (out / "movements.csv").open() as stream:
+        rows = {int(row["fdi"]): row for row in csv.DictReader(stream)}
+    assert rows[12]["moved"] == "yes"
+    at = next(np.array(t["at"]) for t in said["teeth"] if t["fdi"] == 12)
+    true = np.linalg.norm(solving.displacement(motions[12], at)[:3])
+    assert float(rows[12]["distance_mm"]) == pytest.approx(true, abs=0.15)
+    page = (out / "register.html").read_text()
+    assert page.count("data:image/jpeg") == 9
+    assert "http" not in page.replace("http-equiv", "")
+    assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
+
+
+def test_no_workspace_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="not a workspace"):
+        run_register(workspaces[0], tmp_path)
+
+
+def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
+    half = tmp_path / "half"
+    half.mkdir()
+    (half / "request.json").write_text((workspaces[0] / "request.json").read_text())
+    with pytest.raises(RequestError, match="finish the run first"):
+        run_register(half, workspaces[1])
