@@ -10,7 +10,7 @@ BIN := .venv/bin
 SEED ?= 0
 INPUTS ?= 1000
 KILLS ?= 30
-.PHONY: demo test lint wheel-test docs bench soak reader system chromium clean
+.PHONY: demo test lint wheel-test docs gallery bench soak reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -30,6 +30,10 @@ wheel-test: .venv/installed-dev
 # The site, into runs/site: open runs/site/index.html. Links that lead nowhere are errors.
 docs: .venv/installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir runs/site
+
+# The pictures of the site's gallery, and its page: from the sample data, in some minutes.
+gallery: chromium .venv/installed
+	$(BIN)/python tools/gallery.py
 
 bench: .venv/installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

@@ -30,7 +30,8 @@ def commands(page: Path) -> list[list[str]]:
     for block in blocks(page, "", "bash"):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
-            if words and Path(words[0]).name in ("pipeline", "dentalsplat"):
+            ours = words and Path(words[0]).name in ("pipeline", "dentalsplat")
+            if ours and not words[1].startswith("-"):
                 found.append(words[1:])
     return found
 

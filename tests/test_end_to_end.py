@@ -55,8 +55,8 @@ def test_results_hold_every_output(done: RunSummary) -> None:
     assert done.results is not None
     names = {path.name for path in done.results.iterdir()}
     assert {
-        "viewer.html", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl", "colmap",
-        "transforms.json", "scene.json", "preview.png",
+        "viewer.html", "orbit.mp4", "splats.ply", "splats.spz", "mesh.ply",
+        "mesh.stl", "colmap", "transforms.json", "scene.json", "preview.png",
     } <= names  # fmt: skip
 
 

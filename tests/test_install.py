@@ -66,7 +66,10 @@ def test_what_is_imported_is_required(setup_cfg: configparser.ConfigParser) -> N
         "cv2": "opencv-contrib-python-headless", "PIL": "pillow", "pillow_heif": "pillow-heif",
         "yaml": "pyyaml", "pydantic_core": "pydantic",
     }  # fmt: skip
-    optional = {"torch", "torchmetrics", "gsplat", "pyinstrument"}
+    optional = {
+        "torch", "torchmetrics", "gsplat", "pyinstrument", "dask", "distributed",
+        "psutil", "pydicom",
+    }  # fmt: skip
     imported = set()
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

@@ -27,7 +27,8 @@ SOURCES = (
 #: What a wheel must hold beside its modules.
 DATA = (
     "dentalsplat/py.typed", "pipeline/py.typed", "stages/py.typed", "stages/teeth/reader.onnx",
-    "stages/export/viewer.html", "stages/export/splat.vert.glsl", "stages/export/renderer.js",
+    "stages/export/viewer/viewer.html", "stages/export/viewer/splat.vert.glsl",
+    "stages/export/viewer/viewer.css", "stages/export/viewer/renderer.js",
     "pipeline/presets/dentalsplat.yaml", "pipeline/presets/suites/smoke.yaml",
 )  # fmt: skip
 SHORT = ("fit.iterations=60", "export.video_seconds=1", "export.mesh_faces=5000")
