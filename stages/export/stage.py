@@ -59,6 +59,7 @@ class ExportStage(Stage):
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.space.frames import frame_of
         from pipeline.artifacts.space.scale import NO_SCALE
+        from stages.export.beside import Beside
         from stages.export.mesh.building import build_mesh
         from stages.export.scene import assemble
         from stages.export.splatfiles.writing import write_splats
@@ -90,46 +91,50 @@ class ExportStage(Stage):
             "gaussians": len(scene.gaussians),
         }
         skipped: dict[str, str] = {}
-        context.progress("splats", 0, 1)
-        write_splats(folder, scene, frame.stands, comments, config.splat_files)
-        context.progress("splats", 1, 1)
-        if config.colmap:
-            counts["colmap_points"] = _write_cameras(context, scene, folder, scale)
-        mouth, teeth = None, None
-        if context.has("teeth"):
-            mouth, teeth = _write_teeth(context, views, scene, folder, frame, scale)
-            counts |= {"teeth": len(teeth["teeth"])} if teeth else {}
-        mesh = None
-        if config.mesh:
-            mesh = build_mesh(
-                scene, config.mesh_method, config.mesh_resolution, config.mesh_cell,
-                config.mesh_views, config.mesh_depth, config.mesh_confidence, config.mesh_faces,
-                context.progress,
-            )  # fmt: skip
-            context.progress("mesh", 1, 1)
-        frames = _write_video(context, scene, folder) if config.video else None
-        page_bytes = 0
-        if config.viewer:
-            known = _knowledge(scene, frame, scale, mouth, teeth, mesh)
-            page_bytes = _write_page(context, scene, folder, known)
-        if mesh is not None:
-            _write_mesh(context, cameras, scene, mesh, mouth, folder, frame, scale, skipped)
-            counts["mesh_faces"] = len(mesh)
-        elif config.mesh:
-            skipped["mesh"] = "too little surface for a mesh"
-            context.warn(
-                "No mesh was made: too little of the surface is known. More photographs that "
-                "overlap would help; the other exports are complete."
-            )
-        if frames is not None:
-            counts["video_frames"] = frames
+        mouth, teeth, mesh, page, model_points = None, None, None, None, None
+        with Beside(context.threads) as beside:
+            beside.give(write_splats, folder, scene, frame.stands, comments, config.splat_files)
+            if config.colmap:
+                import pycolmap  # noqa: F401  only in this thread can signals wait meanwhile
+
+                model_points = beside.give(_write_cameras, context, scene, folder, scale)
+            if context.has("teeth"):
+                mouth, teeth = _write_teeth(context, views, scene, folder, frame, scale)
+            if config.mesh:
+                mesh = build_mesh(
+                    scene, config.mesh_method, config.mesh_resolution, config.mesh_cell,
+                    config.mesh_views, config.mesh_depth, config.mesh_confidence,
+                    config.mesh_faces, context.progress,
+                )  # fmt: skip
+                context.progress("mesh", 1, 1)
+            if config.viewer:
+                known = _knowledge(scene, frame, scale, mouth, teeth, mesh)
+                page = beside.give(_write_page, context, scene, folder, known)
+            if mesh is not None:
+                beside.give(
+                    _write_mesh, context, cameras, scene, mesh, mouth, folder, frame, scale, skipped
+                )
+            elif config.mesh:
+                skipped["mesh"] = "too little surface for a mesh"
+                context.warn(
+                    "No mesh was made: too little of the surface is known. More photographs that "
+                    "overlap would help; the other exports are complete."
+                )
+            frames = _write_video(context, scene, folder) if config.video else None
+        made = {
+            "colmap_points": model_points() if model_points else None,
+            "teeth": len(teeth["teeth"]) if teeth else None,
+            "mesh_faces": len(mesh) if mesh is not None else None,
+            "video_frames": frames,
+        }
+        counts |= {name: count for name, count in made.items() if count is not None}
         if config.preview:
             _write_preview(context, scene, mesh, folder)
         _describe(scene, folder, frame, scale, counts, skipped, self.libraries)
         context.summarize(
             splats=len(scene.gaussians),
             mesh_faces=counts.get("mesh_faces", 0),
-            page_mb=round(page_bytes / 1e6, 2),
+            page_mb=round(page() / 1e6, 2) if page else 0,
         )
 
 
@@ -144,7 +149,6 @@ def _write_mesh(
     from stages.export.mesh.writing import Writer, write_meshes, write_models
 
     config: ExportConfig = context.config
-    context.progress("mesh files", 0, 1)
     seen = sights(mesh, scene.cameras, scene.masks)
     colored = None
     if config.mesh_texture:
@@ -156,7 +160,6 @@ def _write_mesh(
     writer = Writer(folder, frame, scale)
     write_meshes(writer, mesh, colored, jaws if config.mesh_jaws else {})
     if config.mesh_base:
-        context.progress("closed models", 0, 1)
         lacking = write_models(
             writer, mesh, jaws, cameras.mouth_from_world, config.mesh_base_height,
             config.mesh_base_depth, config.mesh_faces,
@@ -167,7 +170,6 @@ def _write_mesh(
                 "Not every closed model that was asked for (export.mesh_base) was made: "
                 f"{lacking}. The other exports are complete."
             )
-    context.progress("mesh files", 1, 1)
 
 
 def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Scale) -> int:
@@ -176,7 +178,6 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Sca
     from stages.export import models
     from stages.export.scene import thinned
 
-    context.progress("COLMAP model", 0, 1)
     for camera in scene.cameras:
         _write_image(folder / "colmap" / "images" / f"{camera.name}.png", scene.photos[camera.name])
         if scene.masked:
@@ -194,7 +195,6 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Sca
         notes["units"] = "mm"
     transforms = models.nerfstudio_transforms(scene.cameras, scene.masked, notes)
     models.write_json(folder / "transforms.json", transforms)
-    context.progress("COLMAP model", 1, 1)
     return count
 
 
@@ -204,9 +204,9 @@ def _write_teeth(
     """`teeth.json` and `teeth.csv`, if there are teeth; returns both, measured."""
     from stages.export.measuring.measures import NOTES
     from stages.export.measuring.mouth import read_mouth
+    from stages.export.measuring.teeth_table import teeth_table
     from stages.export.models import write_json
     from stages.export.teeth import describe_teeth
-    from stages.export.teeth_table import teeth_table
 
     teeth: Teeth = context.load("teeth")
     if not teeth.chosen:
@@ -286,14 +286,12 @@ def _write_page(context: StageContext, scene: Scene, folder: Path, knowledge: Kn
     from stages.export.viewer.page import build_page, rasterizer_constants
 
     config: ExportConfig = context.config
-    context.progress("viewer page", 0, 1)
     page = build_page(
         scene.gaussians, scene.cameras, scene.orbit,
         scene.photos if config.viewer_photos else {},
         rasterizer_constants(scene.gaussians, scene.cameras),
         config.viewer_sh_degree, config.viewer_photo_quality, knowledge,
     )  # fmt: skip
-    context.progress("viewer page", 1, 1)
     return (folder / "viewer.html").write_bytes(page.encode())
 
 

@@ -17,6 +17,7 @@ from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
+from stages.export.measuring.teeth_table import teeth_table, tooth_name
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage
 from stages.export.teeth import (
@@ -26,7 +27,6 @@ from stages.export.teeth import (
     joint_centre,
     without_names,
 )
-from stages.export.teeth_table import teeth_table, tooth_name
 from tests.stages import export_scene as scene
 from tests.stages.ball_teeth_case import PLACES, cap_outline, teeth_of_ball
 

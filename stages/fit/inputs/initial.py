@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.arrays import AnyArray, Array, Bools, Floats, Indices
+from stages.splatting.threads import workers
 
 SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
 
@@ -121,22 +122,27 @@ def neighbour_spacing(positions: Array) -> Array:
     """[N] root mean square distance to the three nearest neighbours (3DGS's initialisation)."""
     if len(positions) < 4:
         return np.full(len(positions), 1e-2)
-    distance, _ = cKDTree(positions).query(positions, k=4)
+    distance, _ = cKDTree(positions).query(positions, k=4, workers=workers())
     return np.sqrt(np.maximum((distance[:, 1:] ** 2).mean(1), 1e-7 * np.median(distance) ** 2))
 
 
-def smooth_normals(cloud: Cloud, neighbours: int) -> Cloud:
-    """Normals averaged over so many neighbours, weighted by confidence; 0 or 1: as they are."""
+def smooth_normals(cloud: Cloud, neighbours: int, every: int = 1) -> Cloud:
+    """Normals averaged over so many neighbours, weighted by confidence; 0 or 1: as they are.
+
+    Of `every` so many points one is returned; all are neighbours.
+    """
+    some = cloud.select(np.arange(len(cloud)) % every == 0)
     if neighbours < 2 or len(cloud) < neighbours:
-        return cloud
-    _, index = cKDTree(cloud.positions).query(cloud.positions, k=neighbours)
+        return some
+    tree = cKDTree(cloud.positions)
+    _, index = tree.query(some.positions, k=neighbours, workers=workers())
     weight = cloud.weight[index]
     # what looks away is another surface
-    weight = weight * ((cloud.normals[index] * cloud.normals[:, None]).sum(-1) > 0.3)
+    weight = weight * ((cloud.normals[index] * some.normals[:, None]).sum(-1) > 0.3)
     mean = (cloud.normals[index] * weight[..., None]).sum(1)
     length = np.linalg.norm(mean, axis=1, keepdims=True)
-    normals = np.where(length > 1e-9, mean / np.maximum(length, 1e-9), cloud.normals)
-    return Cloud(cloud.positions, cloud.colors, normals, cloud.weight)
+    normals = np.where(length > 1e-9, mean / np.maximum(length, 1e-9), some.normals)
+    return Cloud(some.positions, some.colors, normals, some.weight)
 
 
 def facing(positions: Array, normals: Array, cameras: Sequence[Camera]) -> Array:

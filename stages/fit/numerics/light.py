@@ -75,8 +75,7 @@ def prediction_errors(
         photographs with one gain; None where no two photographs share enough surface.
     """
     every = -(-len(cloud) // MOST_POINTS)
-    smooth = smooth_normals(cloud, NEIGHBOURS)
-    points = smooth.select(np.arange(len(cloud)) % max(every, 1) == 0)
+    points = smooth_normals(cloud, NEIGHBOURS, max(every, 1))
     sights = [
         _sight(points, cloud.positions, image, mask, camera, gamma)
         for image, mask, camera in zip(images, masks, cameras, strict=True)

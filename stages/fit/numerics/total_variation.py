@@ -24,7 +24,7 @@ from stages.splatting.lanes.vectors import (
     store_from,
     where,
 )
-from stages.splatting.threads import KERNELS
+from stages.splatting.threads import KERNELS, workers
 
 F = np.float32
 CHUNK = 256
@@ -79,6 +79,50 @@ def _many_columns(  # type: ignore[no-untyped-def]
                 store_from(gradient, place, load_from(gradient, place) + total * weight)
 
 
+@inlined
+def _among(row, number):  # type: ignore[no-untyped-def]
+    found = False
+    for other in row:
+        found |= other == number
+    return found
+
+
+@kernel(parallel=True)
+def _both_ways(found: Integers):  # type: ignore[no-untyped-def]
+    """Who is among whose nearest, from both ends, in order: [E] neighbours, [N + 1] starts.
+
+    `found` [N, K] has the nearest of each; it may itself be among them.
+    """
+    number = len(found)
+    one_way = np.empty(found.shape, np.bool_)
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            for k in range(found.shape[1]):
+                one_way[i, k] = not _among(found[found[i, k]], i)
+    degree = np.zeros(number, np.int32)
+    for i in range(number):
+        for k in range(found.shape[1]):
+            degree[i] += found[i, k] != i
+            degree[found[i, k]] += one_way[i, k]
+    starts = np.zeros(number + 1, np.int32)
+    starts[1:] = np.cumsum(degree)
+    neighbours = np.empty(starts[number], np.int32)
+    filled = starts[:number].copy()
+    for i in range(number):
+        for k in range(found.shape[1]):
+            other = found[i, k]
+            if other != i:
+                neighbours[filled[i]] = other
+                filled[i] += 1
+                if one_way[i, k]:
+                    neighbours[filled[other]] = i
+                    filled[other] += 1
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            neighbours[starts[i] : starts[i + 1]].sort()
+    return neighbours, starts
+
+
 class TotalVariation:
     """Weight times the mean, over Gaussians and their neighbours, of how their colours differ.
 
@@ -129,14 +173,10 @@ class TotalVariation:
         """The neighbours; `starts` is set."""
         number = len(positions)
         count = min(self.count, number - 1)
-        _, found = cKDTree(positions).query(positions, k=count + 1)
-        own = np.repeat(np.arange(number), count + 1)
-        other = found.ravel()
-        keys = np.concatenate([own * number + other, other * number + own])
-        keys = np.sort(keys[keys // number != keys % number])  # none is its own neighbour
-        keys = keys[np.diff(keys, prepend=-1) > 0]
-        self.starts = np.searchsorted(keys // number, np.arange(number + 1)).astype(np.int32)
-        return (keys % number).astype(np.int32)
+        _, found = cKDTree(positions).query(positions, k=count + 1, workers=workers())
+        with KERNELS:
+            neighbours, self.starts = _both_ways(found.astype(np.int32))
+        return neighbours
 
     def forget(self) -> None:
         """Other Gaussians have taken the place of those that were compared."""
