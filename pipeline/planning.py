@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -65,11 +65,23 @@ class Chain:
         names: the stages of this run.
         upstream: stages before the first one named, whose results in use are taken as they are.
         implicit: those of `names` that run only because photographs were given.
+        standing: `upstream` and `implicit`, in the order of the config.
     """
 
     names: tuple[str, ...]
     upstream: tuple[str, ...] = ()
     implicit: tuple[str, ...] = ()
+    standing: tuple[str, ...] = ()
+
+    def superseded(self, name: str, by: str) -> bool:
+        """Has an upstream stage made its own of what an implicit stage before it makes?
+
+        `init` turns the photographs that `views` reads: a fit that is run again with the
+        photographs named takes those of `init`, as it did the first time.
+        """
+        if name not in self.implicit or by not in self.upstream:
+            return False
+        return self.standing.index(by) > self.standing.index(name)
 
 
 def resolve_chain(
@@ -115,7 +127,8 @@ def resolve_chain(
     first = next((name for name in names if name not in implicit), names[0])
     position = order.index(first) if first in order else len(order)
     upstream = tuple(name for name in order[:position] if name not in names)
-    return Chain(names, upstream, implicit)
+    standing = tuple(name for name in order if name in upstream or name in implicit)
+    return Chain(names, upstream, implicit, standing)
 
 
 def _prepares(name: str, names: Sequence[str], usable: Mapping[str, Stage]) -> bool:
@@ -151,6 +164,15 @@ def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
             raise RequestError(_nobody_provides(name, lacking, chain, available))
         available |= set(stage.provides)
     return table
+
+
+def provide(
+    table: dict[str, Input], chain: Chain, name: str, kinds: Iterable[str], result: Result | None
+) -> None:
+    """Enter what a stage of the chain has made, or will make, into the provider table."""
+    for kind in kinds:
+        if kind not in table or not chain.superseded(name, by=table[kind].stage):
+            table[kind] = Input(name, kind, result)
 
 
 def _nobody_provides(name: str, kinds: Sequence[str], chain: Chain, held: set[str]) -> str:
@@ -297,8 +319,7 @@ def plan_chain(
             made = tuple(stage.result.contents)
         else:
             made = (*get_stage(name).provides, *get_stage(name).may_provide)
-        for kind in made:
-            table[kind] = Input(name, kind, stage.result)
+        provide(table, chain, name, made, stage.result)
     return planned
 
 

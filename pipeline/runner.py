@@ -17,10 +17,10 @@ from pipeline.kernels.news import told_to
 from pipeline.kernels.rehearsals import Background
 from pipeline.measure import Measurement
 from pipeline.planning import (
-    Input,
     PlannedStage,
     plan_chain,
     plan_stage,
+    provide,
     provider_table,
     resolve_chain,
 )
@@ -206,7 +206,6 @@ class Runner:
         self.reporter.start(list(self.chain.names))
         try:
             self.reporter.foreseen(self._foreseen(planned, force))
-            self._check_upstream()
             with self._kernels(stage.name for stage in planned if force or stage.result is None):
                 return self._run_all(force)
         finally:
@@ -253,15 +252,15 @@ class Runner:
         return found
 
     def _check_upstream(self) -> None:
-        """Warn where the results taken as they are do not fit together."""
+        """Warn where the results taken as they are do not fit together, or the photographs."""
         contents: dict[str, str] = {}
-        for name in self.chain.upstream:
+        for name in self.chain.standing:
             result = self.store.current(name)
             if result is None:
                 continue
             made_from = result.manifest["key_material"]["inputs"]
             for kind, content in made_from.items():
-                if contents.get(kind, content) != content:
+                if name in self.chain.upstream and contents.get(kind, content) != content:
                     self.reporter.message(
                         f"The result of '{name}' in use was computed from other {kind} than those "
                         f"now in use; it is taken as it is. Run with --from {name} to renew it."
@@ -284,16 +283,18 @@ class Runner:
     def _run_once(self, force: bool, done: set[str]) -> RunSummary:
         summary = RunSummary(self.request.workspace)
         table = provider_table(self.chain, self.store)
+        named = [name for name in self.chain.names if name not in self.chain.implicit]
         for name in self.chain.names:
+            if not done.intersection(named) and name in named[:1]:
+                self._check_upstream()  # now that those before have run
             planned = plan_stage(name, self.config, self.store, table, self.request.images)
             must = force and name not in done and name not in self.chain.implicit
             outcome, result = self._reuse_or_run(planned, must)
             done.add(name)
             summary.stages.append(outcome)
-            for kind in result.contents:
-                table[kind] = Input(name, kind, result)
-                if kind == "exports":
-                    summary.results = self.store.link_results(result, kind)
+            provide(table, self.chain, name, result.contents, result)
+            if "exports" in result.contents:
+                summary.results = self.store.link_results(result, "exports")
         return summary
 
     def _reuse_or_run(self, planned: PlannedStage, force: bool) -> tuple[StageOutcome, Result]:

@@ -94,17 +94,39 @@ def test_from_begins_in_the_middle(run: Any) -> None:
     }  # fmt: skip
 
 
-def test_from_warns_of_results_that_do_not_fit_together(run: Any, toys: Path) -> None:
-    class Ears(pipeline.runner.Reporter):
-        heard: list[str] = []  # noqa: RUF012
+def test_photographs_named_again_do_not_supersede_what_was_made_of_them(run: Any) -> None:
+    """`scale` makes its own numbers of those that `read` makes: a later stage wants those."""
+    whole = {"read": "cached", "count": "cached"}
+    run()
+    assert run(stages=["count"]) == whole
+    assert run(stages=["count"], dry_run=True) == whole
+    assert run(from_stage="count") == {**whole, "publish": "cached"}
 
-        def message(self, text: str) -> None:
-            self.heard.append(text)
 
+class Ears(pipeline.runner.Reporter):
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.heard.append(text)
+
+
+def test_from_warns_of_results_that_do_not_fit_together(run: Any) -> None:
+    ears = Ears()
     run()
     run("read.keep=2", stages=["read"])
-    run(from_stage="publish", images=(), reporter=Ears())
-    assert any("'scale' in use was computed from other numbers" in text for text in Ears.heard)
+    run(from_stage="publish", images=(), reporter=ears)
+    assert any("'scale' in use was computed from other numbers" in text for text in ears.heard)
+
+
+def test_other_photographs_than_those_of_the_results_in_use_are_said(run: Any, toys: Path) -> None:
+    ears = Ears()
+    run(reporter=ears)
+    run(stages=["count"], reporter=ears)
+    assert not any("computed from other" in text for text in ears.heard)
+    (toys / "images" / "1.txt").write_text("5")
+    run(stages=["count"], reporter=ears)
+    assert any("'scale' in use was computed from other numbers" in text for text in ears.heard)
 
 
 def test_unknown_and_repeated_stages_are_refused(run: Any) -> None:
