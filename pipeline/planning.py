@@ -73,16 +73,6 @@ class Chain:
     implicit: tuple[str, ...] = ()
     standing: tuple[str, ...] = ()
 
-    def superseded(self, name: str, by: str) -> bool:
-        """Has an upstream stage made its own of what an implicit stage before it makes?
-
-        `init` turns the photographs that `views` reads: a fit that is run again with the
-        photographs named takes those of `init`, as it did the first time.
-        """
-        if name not in self.implicit or by not in self.upstream:
-            return False
-        return self.standing.index(by) > self.standing.index(name)
-
 
 def resolve_chain(
     config: Config,
@@ -144,35 +134,44 @@ def _prepares(name: str, names: Sequence[str], usable: Mapping[str, Stage]) -> b
     return bool(wanted & set(usable[name].provides))
 
 
-def provider_table(chain: Chain, store: Store) -> dict[str, Input]:
-    """Artifact kind -> where it comes from, as the workspace offers it before the run.
+class Providers:
+    """Where each kind of artifact comes from, for one stage of a chain after the other.
 
-    Raises:
-        RequestError: a needed kind is provided by no earlier stage and the workspace has none, or
-            it can't be told which result is in use.
+    A stage takes what the last one before it made, in the order of the config. `init` turns the
+    photographs that `views` reads: a fit that is run again with the photographs named, so that
+    `views` runs first, takes those of `init`, as it did the first time.
     """
-    table: dict[str, Input] = {}
-    for name in chain.upstream:
-        result = store.in_use(name)
-        for kind in result.contents if result else {}:
-            table[kind] = Input(name, kind, result)
-    available = set(table)
-    for name in chain.names:
-        stage = get_stage(name)
-        lacking = [kind for kind in stage.requires if kind not in available]
-        if lacking:
-            raise RequestError(_nobody_provides(name, lacking, chain, available))
-        available |= set(stage.provides)
-    return table
 
+    def __init__(self, chain: Chain, store: Store) -> None:
+        """
+        Raises:
+            RequestError: a needed kind is provided by no earlier stage and the workspace has none,
+                or it can't be told which result is in use.
+        """
+        self._chain = chain
+        self._upstream = {name: store.in_use(name) for name in chain.upstream}
+        self._table: dict[str, Input] = {}
+        results = [result for result in self._upstream.values() if result]
+        available = {kind for result in results for kind in result.contents}
+        for name in chain.names:
+            stage = get_stage(name)
+            lacking = [kind for kind in stage.requires if kind not in available]
+            if lacking:
+                raise RequestError(_nobody_provides(name, lacking, chain, available))
+            available |= set(stage.provides)
 
-def provide(
-    table: dict[str, Input], chain: Chain, name: str, kinds: Iterable[str], result: Result | None
-) -> None:
-    """Enter what a stage of the chain has made, or will make, into the provider table."""
-    for kind in kinds:
-        if kind not in table or not chain.superseded(name, by=table[kind].stage):
-            table[kind] = Input(name, kind, result)
+    def of(self, name: str) -> Mapping[str, Input]:
+        """Artifact kind -> where the next stage of the chain takes it from."""
+        standing = self._chain.standing
+        first = standing[: standing.index(name)] if name in self._chain.implicit else standing
+        for other in first:
+            result = self._upstream.pop(other, None)
+            self.enter(other, result.contents if result else (), result)
+        return self._table
+
+    def enter(self, name: str, kinds: Iterable[str], result: Result | None) -> None:
+        """What a stage has made, or will make."""
+        self._table |= {kind: Input(name, kind, result) for kind in kinds}
 
 
 def _nobody_provides(name: str, kinds: Sequence[str], chain: Chain, held: set[str]) -> str:
@@ -310,16 +309,16 @@ def plan_chain(
     Raises:
         RequestError: a needed kind is nowhere, or the photographs can't be found or read.
     """
-    table = provider_table(chain, store)
+    providers = Providers(chain, store)
     planned = []
     for name in chain.names:
-        stage = plan_stage(name, config, store, table, images)
+        stage = plan_stage(name, config, store, providers.of(name), images)
         planned.append(stage)
         if stage.result is not None:
             made = tuple(stage.result.contents)
         else:
             made = (*get_stage(name).provides, *get_stage(name).may_provide)
-        provide(table, chain, name, made, stage.result)
+        providers.enter(name, made, stage.result)
     return planned
 
 

@@ -18,10 +18,9 @@ from pipeline.kernels.rehearsals import Background
 from pipeline.measure import Measurement
 from pipeline.planning import (
     PlannedStage,
+    Providers,
     plan_chain,
     plan_stage,
-    provide,
-    provider_table,
     resolve_chain,
 )
 from pipeline.process import signals
@@ -282,17 +281,18 @@ class Runner:
 
     def _run_once(self, force: bool, done: set[str]) -> RunSummary:
         summary = RunSummary(self.request.workspace)
-        table = provider_table(self.chain, self.store)
+        providers = Providers(self.chain, self.store)
         named = [name for name in self.chain.names if name not in self.chain.implicit]
         for name in self.chain.names:
             if not done.intersection(named) and name in named[:1]:
                 self._check_upstream()  # now that those before have run
+            table = providers.of(name)
             planned = plan_stage(name, self.config, self.store, table, self.request.images)
             must = force and name not in done and name not in self.chain.implicit
             outcome, result = self._reuse_or_run(planned, must)
             done.add(name)
             summary.stages.append(outcome)
-            provide(table, self.chain, name, result.contents, result)
+            providers.enter(name, result.contents, result)
             if "exports" in result.contents:
                 summary.results = self.store.link_results(result, "exports")
         return summary

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from toy import artifact_bytes
+from toy import STAGES, ToyEntryPoint, artifact_bytes
 
 import pipeline
 from pipeline.artifacts.views import read_png
+from pipeline.stage import Stage, StageConfig, StageContext
 from pipeline.store import Store
 
 ALL_RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
@@ -101,6 +102,31 @@ def test_photographs_named_again_do_not_supersede_what_was_made_of_them(run: Any
     assert run(stages=["count"]) == whole
     assert run(stages=["count"], dry_run=True) == whole
     assert run(from_stage="count") == {**whole, "publish": "cached"}
+
+
+class PeekStage(Stage):
+    """Quick, and run unasked where a stage that was named can use what it says."""
+
+    name, version, summary = "peek", 1, "notes the largest number"
+    requires = ("numbers",)
+    provides = ("metrics",)
+    prepares = True
+    Config = StageConfig
+
+    def run(self, context: StageContext) -> None:
+        largest = max(context.load("numbers").values)
+        (context.output("metrics") / "metrics.json").write_text(f'{{"total": {largest}}}')
+
+
+def test_a_stage_that_runs_unasked_sees_what_it_saw_before(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands before `scale`, whose numbers are not for it."""
+    monkeypatch.setitem(STAGES, "peek", [ToyEntryPoint(PeekStage)])
+    (toys / "toy.yaml").write_text("stages: [read, peek, scale, publish]\n")
+    assert run() == {"read": "ran", "peek": "ran", "scale": "ran", "publish": "ran"}
+    cached = {"read": "cached", "peek": "cached", "publish": "cached"}
+    assert run(stages=["publish"]) == cached
 
 
 class Ears(pipeline.runner.Reporter):
