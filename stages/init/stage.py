@@ -32,7 +32,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 12
+    version = 13
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -177,6 +177,7 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 
 def _from_features(context: StageContext, views: Views) -> None:
+    from stages.init.dental.place import from_teeth
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
@@ -186,23 +187,43 @@ def _from_features(context: StageContext, views: Views) -> None:
     refinement = RefinementOptions(**config.refinement.model_dump())
     if refinement.unroll and _stand_upright(context, views):
         refinement = replace(refinement, unroll=False)
+    told: list[str] = []
     try:
         placement = place_classical(
             list(views.views), with_focals(views.views, config.focal), config.focal is not None,
             views.ordered, least_views(len(views), config.min_views_fraction),
             _classical_options(config), refinement,
             seed=context.seed, threads=context.threads,
-            scratch=context.scratch, progress=context.progress, warn=context.warn,
+            scratch=context.scratch, progress=context.progress, warn=told.append,
             pictures=config.match_pictures,
         )  # fmt: skip
     except ReconstructionError as unplaced:
         if config.method != "auto":
             raise
-        if not _teeth_are_worth_a_try(context, views):
+        if not _teeth_to_try(context, views):
             raise _with_what_was_set_aside(context, views, unplaced) from unplaced
         _from_teeth_instead(context, views, unplaced)
-    else:
-        densify(context, views, placement.normalised())
+        return
+    placed = {camera.name for camera in placement.cameras}
+    if config.method == "auto" and _teeth_know_more(_teeth_to_try(context, views), placed):
+        context.progress("features link few of the photographs; trying the teeth", 0, 1)
+        try:
+            from_teeth(context, views)
+            return
+        except ReconstructionError as doubtful:
+            told.append(f"The teeth do not place more of the photographs: {doubtful}")
+    for text in told:
+        context.warn(text)
+    densify(context, views, placement.normalised())
+
+
+def _teeth_know_more(shown: set[str], placed: set[str]) -> bool:
+    """Would the dental path place a mouth of which features have placed hardly any?
+
+    Two photographs of the front look alike and are linked; those of the sides, by which the arch
+    is known, are then missing. Features that do place enough of the mouth place it better.
+    """
+    return len(shown & placed) < DENTAL_VIEWS[0] <= len(shown)
 
 
 def _stand_upright(context: StageContext, views: Views) -> bool:
@@ -214,15 +235,18 @@ def _stand_upright(context: StageContext, views: Views) -> bool:
     return len(rolls) == len(views) and max(rolls) < UPRIGHT
 
 
-def _teeth_are_worth_a_try(context: StageContext, views: Views) -> bool:
-    """Few photographs, and of teeth: the dental path may place what features could not."""
+def _teeth_to_try(context: StageContext, views: Views) -> set[str]:
+    """Views that the dental path may place; empty where it is not worth a try.
+
+    Few photographs, and of teeth.
+    """
     from stages.init.dental.place import labelled_teeth
 
     if not context.has("teeth"):
-        return False
+        return set()
     teeth = labelled_teeth(context, views)
     shown = {dentition.name for dentition in teeth.chosen} & set(views.by_name())
-    return DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1]
+    return shown if DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1] else set()
 
 
 def _with_what_was_set_aside(
@@ -319,7 +343,7 @@ def _teeth_are_wide_apart(
     posed = tuple(view for view in views.views if view.name in known)
     angle = neighbour_angle([pinhole_camera(view, known[view.name], CAMERAS) for view in posed])
     wide = angle > config.dental.wide_angle
-    return wide and _teeth_are_worth_a_try(context, replace(views, views=posed))
+    return wide and bool(_teeth_to_try(context, replace(views, views=posed)))
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:

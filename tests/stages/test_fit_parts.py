@@ -177,7 +177,8 @@ def test_a_surface_is_held_where_few_views_are_far_apart() -> None:
         return worth_holding(cameras, np.zeros((5, 3)), 30.0)
 
     assert held([-45, 0, 45])
-    assert not held([-45, 0, 20])
+    assert held([-45, -30, 45])  # two look alike, and the third is known by them alone
+    assert not held([-25, 0, 20])
     assert not held([-60, -25, 10, 45])
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.corrections import CORRECTIONS
 from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.artifacts.space.scale import Scale
@@ -16,6 +17,7 @@ from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
 from stages.init.dental.reconstruct import with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
+from stages.init.placement import Placement
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import (
     LOWER,
@@ -314,3 +316,39 @@ def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypat
         auto(tmp_path, 3, read_teeth())
     assert caught.value.pictures == picture
     assert caught.value.artifacts == read
+
+
+def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, monkeypatch):
+    """Two frontal photographs look alike: features link these and leave the sides out."""
+    tried, densified = [], []
+
+    def link(names):
+        cameras = [Camera(name, 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)) for name in names]
+        placement = Placement((), tuple(cameras), np.zeros((0, 3)), (), {})
+        monkeypatch.setattr(Placement, "normalised", lambda self: self)
+        monkeypatch.setattr("stages.init.place.place_classical", lambda *_, **__: placement)
+
+    monkeypatch.setattr("stages.init.write.densify", lambda *_: densified.append(1))
+    monkeypatch.setattr(
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
+    )
+    names = [view.name for view in photographs(4).views]
+    read = read_teeth(4, aside=(2,))
+    link([names[1], names[2]])
+    auto(tmp_path / "few", 4, read)
+    assert (tried, densified) == ([1], [])
+    auto(tmp_path / "as_asked", 4, read, method="colmap")
+    auto(tmp_path / "no_teeth", 4)
+    assert (tried, densified) == ([1], [1, 1])
+    link([names[0], names[1], names[3]])
+    auto(tmp_path / "enough", 4, read)
+    assert (tried, densified) == ([1], [1, 1, 1])
+
+    def doubtful(context, views):
+        raise ReconstructionError("Photo 1 and 2 hardly agree.")
+
+    link([names[1], names[2]])
+    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
+    context = auto(tmp_path / "doubtful", 4, read)
+    assert densified == [1, 1, 1, 1]
+    assert any("hardly agree" in text for text in context.warnings)

@@ -48,11 +48,11 @@ class Surface(
     """
 
     class Settings(PartSettings):
-        hold_surface: AutoBool = automatic("up to 3 views that are far apart")
+        hold_surface: AutoBool = automatic("up to 3 views, one or more of them far from the others")
         """keep Gaussians flat and on the surface of the input points, in proportion to
         confidence"""
         hold_min_angle: Annotated[float, Field(ge=0, le=180)] = 22.0
-        """hold_surface auto: neighbouring views further apart than this, degrees"""
+        """hold_surface auto: a view further from the nearest other one than this, degrees"""
         hold_strength: Share = 0.15
         """share of the way back that a sure Gaussian goes after each step"""
         hold_flatness: Annotated[float, Field(gt=0, le=1)] = 0.6
@@ -178,14 +178,15 @@ def steepest(s: FitSettings, lit: bool) -> float:
 def worth_holding(cameras: Sequence[Camera], positions: Array, least_angle: float) -> bool:
     """What ``hold_surface: auto`` comes to.
 
-    Where neighbouring views are too far apart to be matched, the points are a surface that was
-    inferred as a whole, and the photographs can't correct it. Where views do overlap closely,
+    Where a view is too far from all others to be matched, the points that it shows are a surface
+    that was inferred as a whole, and the photographs can't correct it. Where all overlap closely,
     holding costs more than it gives.
 
     Args:
         cameras: the placed ones.
         positions: [N, 3] the points, in the world of the cameras.
-        least_angle: degrees that every two views are apart, seen from the middle of the points.
+        least_angle: degrees from a view to the nearest other one, seen from the middle of the
+            points.
     """
     if not 2 <= len(cameras) <= FEW_VIEWS:
         return False
@@ -193,5 +194,5 @@ def worth_holding(cameras: Sequence[Camera], positions: Array, least_angle: floa
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     cosines = rays @ rays.T
     np.fill_diagonal(cosines, -1)
-    closest = np.degrees(np.arccos(np.clip(cosines.max(), -1, 1)))
-    return bool(closest > least_angle)
+    loneliest = np.degrees(np.arccos(np.clip(cosines.max(0).min(), -1, 1)))
+    return bool(loneliest > least_angle)
