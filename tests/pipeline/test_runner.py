@@ -14,6 +14,7 @@ from toy import artifact_bytes
 
 import pipeline
 from pipeline.artifacts.views import read_png
+from pipeline.running.reporter import Reporter
 from pipeline.store import Store
 
 ALL_RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
@@ -95,7 +96,7 @@ def test_from_begins_in_the_middle(run: Any) -> None:
 
 
 def test_from_warns_of_results_that_do_not_fit_together(run: Any, toys: Path) -> None:
-    class Ears(pipeline.runner.Reporter):
+    class Ears(Reporter):
         heard: list[str] = []  # noqa: RUF012
 
         def message(self, text: str) -> None:
