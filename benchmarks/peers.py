@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what is large is imported after the measurement: see `measured`
-    from pipeline.runner import RunSummary
+    from pipeline.running.outcomes import RunSummary
 
 #: What the libraries of peers ask for the number of threads.
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")

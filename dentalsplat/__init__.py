@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
     from pipeline.front.settings import Setting
     from pipeline.process.privacy import Share
-    from pipeline.runner import Reporter, RunSummary
+    from pipeline.running.outcomes import RunSummary
+    from pipeline.running.reporter import Reporter
     from pipeline.stage import Finding
     from pipeline.workspace import StageStatus
 

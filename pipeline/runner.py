@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
-import traceback
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 from pipeline import profiling
 from pipeline.config import Config
@@ -24,138 +19,13 @@ from pipeline.planning import (
     resolve_chain,
 )
 from pipeline.process import signals
-from pipeline.stage import StageContext, get_stage, usable_stages
-from pipeline.store import CorruptResultError, Result, Store, file_in_the_way, is_disk_full
-from pipeline.untrusted.names import readable
+from pipeline.running.context import RunContext
+from pipeline.running.failing import explained
+from pipeline.running.outcomes import RunSummary, StageOutcome, figures_of
+from pipeline.running.reporter import Reporter
+from pipeline.stage import get_stage, usable_stages
+from pipeline.store import CorruptResultError, Result, Store
 from pipeline.workspace import Request
-
-Figure = float | int | str
-
-
-class Reporter:
-    """Hears what happens in a run. This one says nothing; the others show it."""
-
-    def start(self, stages: list[str]) -> None:
-        """A run of these stages begins."""
-
-    def foreseen(self, stages: list[StageOutcome]) -> None:
-        """What is going to be done, before it starts (as `Runner.dry_run` tells it)."""
-
-    def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
-        """A stage begins to compute."""
-
-    def progress(self, stage: str, step: str, done: int, total: int, **figures: Figure) -> None:
-        """A stage has come to `done` of `total` in `step`."""
-
-    def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
-        """A stage's result is in the store."""
-
-    def message(self, text: str) -> None:
-        """Something that the user should know."""
-
-    def stop(self) -> None:
-        """The run is over, well or not."""
-
-
-@dataclass
-class StageOutcome:
-    """What a run did about one stage.
-
-    Attributes:
-        action: ``ran``, ``resumed`` (ran, from a checkpoint) or ``cached``; in a dry run ``would
-            run`` or ``unknown`` (depends on what an earlier stage will give).
-        reasons: why it ran.
-        figures: wall_seconds, cpu_seconds, peak_memory_mb of when it was computed, and `summary`;
-            before it runs, wall_seconds of its last time alone, if there was one.
-    """
-
-    name: str
-    action: str
-    reasons: list[str] = field(default_factory=list)
-    key: str | None = None
-    folder: Path | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-
-
-@dataclass
-class RunSummary:
-    """What a run did, and where its outputs lie."""
-
-    workspace: Path
-    stages: list[StageOutcome] = field(default_factory=list)
-    results: Path | None = None
-    report: Path | None = None
-    check: Path | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON values."""
-        return {
-            "workspace": str(self.workspace),
-            "results": str(self.results) if self.results else None,
-            "report": str(self.report) if self.report else None,
-            "check": str(self.check) if self.check else None,
-            "stages": [
-                {**vars(s), "folder": str(s.folder) if s.folder else None} for s in self.stages
-            ],
-        }
-
-
-class RunContext(StageContext):
-    """The context of a stage that runs for the store."""
-
-    def __init__(
-        self, planned: PlannedStage, config: Config, store: Store, folder: Path, reporter: Reporter
-    ) -> None:
-        self.config = config.sections[planned.name]
-        self.seed = config.run.seed
-        self.threads = config.threads
-        self.scratch = folder / "scratch"
-        self.sources = planned.sources
-        self.warnings: list[str] = []
-        self.figures: dict[str, Any] = {}
-        self.outputs: list[str] = []
-        self._planned = planned
-        self._store = store
-        self._folder = folder
-        self._reporter = reporter
-
-    def has(self, kind: str) -> bool:
-        return kind in self._planned.inputs
-
-    def load(self, kind: str) -> Any:
-        entry = self._planned.inputs.get(kind)
-        if entry is None or entry.result is None:
-            raise StageError(
-                f"The stage '{self._planned.name}' asks for {kind}, which it was not given. "
-                "Name it in `requires`, or in `optional` and ask `has` first."
-            )
-        return self._store.load(entry.result, kind)
-
-    def output(self, kind: str) -> Path:
-        stage = get_stage(self._planned.name)
-        if kind not in (*stage.provides, *stage.may_provide):
-            raise StageError(
-                f"The stage '{stage.name}' writes {kind} without saying so. Name it in `provides` "
-                "or `may_provide`."
-            )
-        path = self._folder / kind
-        path.mkdir(exist_ok=True)
-        if kind not in self.outputs:
-            self.outputs.append(kind)
-        return path
-
-    def progress(self, step: str, done: int, total: int, **figures: float | int | str) -> None:
-        signals.check()
-        self._reporter.progress(self._planned.name, step, done, total, **figures)
-
-    def warn(self, message: str) -> None:
-        message = readable(message)
-        self.warnings.append(message)
-        self._reporter.message(f"{self._planned.name}: {message}")
-
-    def summarize(self, **figures: float | int | str) -> None:
-        self.figures.update(figures)
 
 
 class Runner:
@@ -315,7 +185,7 @@ class Runner:
             previous = result
             result = self._compute(planned, reasons)
             self.store.use(result, reasons)
-        figures = _figures(result)
+        figures = figures_of(result)
         self.reporter.stage_finished(name, False, figures)
         if previous is not None and previous.contents != result.contents:
             self.reporter.message(
@@ -328,7 +198,7 @@ class Runner:
         return outcome, result
 
     def _cached(self, result: Result) -> StageOutcome:
-        figures = _figures(result)
+        figures = figures_of(result)
         self.reporter.stage_finished(result.stage, True, figures)
         return StageOutcome(
             result.stage, "cached", [], result.key, result.folder, figures,
@@ -366,7 +236,7 @@ class Runner:
             raise
         except Exception as error:
             signals.check()
-            raise self._explain_failure(error, name, key) from error
+            raise self._fail(error, name, key) from error
 
     @contextlib.contextmanager
     def _profiled(self, name: str) -> Iterator[None]:
@@ -385,31 +255,9 @@ class Runner:
         names = (*self.chain.upstream, *self.chain.names)
         return [found[name].thrift for name in names if name in found and found[name].thrift]
 
-    def _explain_failure(self, error: Exception, name: str, key: str) -> PipelineError:
-        """Turn any failure into one paragraph, and leave the store as it was."""
-        if is_disk_full(error, self.request.workspace):
-            free = shutil.disk_usage(self.request.workspace).free / 2**20
-            failure: PipelineError = RequestError(
-                f"The disk that holds the workspace {self.request.workspace} is full ({free:.1f} "
-                f"MB left); the stage '{name}' could not write its result. Nothing computed before "
-                "is lost: make room ('pipeline clean' deletes results that are not in use) and run "
-                "the same command again."
-            )
-        elif isinstance(error, PipelineError):
-            failure = error
-        elif told := file_in_the_way(error, self.request.workspace):
-            failure = told
-        elif isinstance(error, MemoryError):
-            failure = StageError(
-                " ".join([f"The stage '{name}' needs more memory than there is.", *self._thrift()])
-            )
-        else:
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            failure = StageError(
-                f"The stage '{name}' failed with a fault of ours: {type(error).__name__}: {error} "
-                f"({Path(where.filename).name}, line {where.lineno}). What earlier stages computed "
-                "is kept. Run again with --debug for the whole trace, and please report it."
-            )
+    def _fail(self, error: Exception, name: str, key: str) -> PipelineError:
+        """The failure as it is told; the store is left as it was, but for a record of it."""
+        failure = explained(error, name, self.request.workspace, self._thrift())
         with contextlib.suppress(OSError):  # the first error is the one to tell
             self.store.discard_outputs(name, key)
         if isinstance(failure, ReconstructionError):
@@ -419,8 +267,3 @@ class Runner:
         with contextlib.suppress(OSError):
             self.store.failures.record(name, key, str(failure))
         return failure
-
-
-def _figures(result: Result) -> dict[str, Any]:
-    names = ("wall_seconds", "cpu_seconds", "peak_memory_mb", "summary")
-    return {name: result.manifest[name] for name in names}

@@ -9,7 +9,7 @@ import pytest
 from filelock import FileLock
 
 import pipeline
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from tests.personal_data import with_personal_data
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"

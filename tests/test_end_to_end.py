@@ -11,7 +11,7 @@ import pytest
 
 import pipeline
 from pipeline.artifacts.cameras import Cameras
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.store import Store
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"

@@ -1,10 +1,10 @@
-"""Look for barriers in a viewer page with axe-core (https://github.com/dequelabs/axe-core).
+"""Look for barriers in a page with a scene with axe-core (https://github.com/dequelabs/axe-core).
 
     npm install axe-core
     python tools/axe.py node_modules/axe-core/axe.min.js runs/demo/results/viewer.html
 
-Runs axe in Chromium at 1280 and 390 pixels, with the tools open, the help open and neither. Exit
-status 1 if it finds anything.
+Runs axe in Chromium at 1280 and 390 pixels; in a viewer page with the tools open, the help open and
+neither. Exit status 1 if it finds anything.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.browser import run_in  # noqa: E402
 SIZES = ((1280, 800), (390, 780))
 SCRIPT = """
 (async () => {
-  await window.dentalsplat?.ready;
+  await (window.dentalsplat ?? window.visits)?.ready;
   const press = (key) => document.body.dispatchEvent(
     new KeyboardEvent("keydown", { key, bubbles: true }));
   const found = {};

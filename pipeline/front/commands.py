@@ -11,7 +11,9 @@ from pipeline.errors import PipelineError, ReconstructionError, StageError
 from pipeline.front.log import Log
 from pipeline.front.pages import write_pages
 from pipeline.process.privacy import Share, kept_for, share_for
-from pipeline.runner import Reporter, Runner, RunSummary
+from pipeline.runner import Runner
+from pipeline.running.outcomes import RunSummary
+from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage, stage_names
 from pipeline.workspace import make_request
 

@@ -17,7 +17,8 @@ from typing import Any, TextIO
 from pipeline.errors import PipelineError
 from pipeline.front.progress import LineReporter, describe
 from pipeline.installed import library_version
-from pipeline.runner import Figure, Reporter, StageOutcome
+from pipeline.running.outcomes import StageOutcome
+from pipeline.running.reporter import Figure, Reporter
 from pipeline.workspace import Request
 
 FOLDER = "logs"

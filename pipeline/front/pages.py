@@ -11,7 +11,7 @@ from pipeline.config import Config
 from pipeline.files import sha256_file
 from pipeline.installed import ROOT
 from pipeline.pages.page import CHECK, REPORT
-from pipeline.runner import Reporter
+from pipeline.running.reporter import Reporter
 from pipeline.store import MANIFEST, Store, read_own, write_sealed
 
 #: What the pages were last made from, and their checksums.

@@ -6,7 +6,8 @@ import sys
 import time
 from typing import Any, TextIO
 
-from pipeline.runner import Figure, Reporter, StageOutcome
+from pipeline.running.outcomes import StageOutcome
+from pipeline.running.reporter import Figure, Reporter
 
 
 def describe(figures: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from pipeline.front.progress import cost, describe, in_words
 from pipeline.front.settings import Setting
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.stage import Finding
 from pipeline.workspace import StageStatus
 

@@ -29,6 +29,8 @@ class Table:
         sums: rows at the end that sum up the others.
         caption: what it shows.
         sortable: a click on a column sorts by it.
+        stacked: on a narrow screen each row is a block of its own, each figure with its column's
+            name; a wide screen shows all columns without scrolling.
     """
 
     macro: ClassVar[str] = "table"
@@ -37,6 +39,7 @@ class Table:
     sums: Sequence[Sequence[Cell]] = ()
     caption: str = ""
     sortable: bool = False
+    stacked: bool = False
 
     @property
     def numeric(self) -> list[bool]:

@@ -20,8 +20,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,57 +44,25 @@ from pipeline.store.faults import reason_of
 from pipeline.store.links import link_to
 from pipeline.store.locks import locked
 from pipeline.store.places import (
-    is_folder,
     is_there,
     make_folder,
     remove,
     set_aside,
     stage_folder,
 )
+from pipeline.store.pointers import Pointers
 from pipeline.store.readers import tell, tighten_workspace
 from pipeline.store.records import (
     MANIFEST,
     DamagedError,
-    Pointer,
     read_manifest,
-    read_record,
     write_sealed,
 )
+from pipeline.store.results import KEY_LENGTH, CorruptResultError, Result
 
-POINTER = "current.json"
-KEY_LENGTH = 12
 #: Of manifests: 2 has a checksum.
 FORMAT = 2
 DISPLACED = ".replaced"
-
-
-class CorruptResultError(Exception):
-    """Files of a committed result are not what its manifest says. It has been quarantined."""
-
-    def __init__(self, stage: str, message: str) -> None:
-        super().__init__(message)
-        self.stage = stage
-
-
-@dataclass(frozen=True)
-class Result:
-    """A committed result of a stage.
-
-    Attributes:
-        stage, key: which one (`key` is the whole sha256).
-        folder: where its files are.
-        manifest: what `manifest.json` says.
-    """
-
-    stage: str
-    key: str
-    folder: Path
-    manifest: dict[str, Any]
-
-    @property
-    def contents(self) -> dict[str, str]:
-        """Artifact kind -> content hash."""
-        return {kind: entry["content"] for kind, entry in self.manifest["outputs"].items()}
 
 
 class Store:
@@ -116,6 +83,7 @@ class Store:
         self._verify = verify
         self._marks: dict[Path, checks.Known] = {}
         self.said: list[str] = []
+        self._pointers = Pointers(root, self._say)
 
     def create(self, stages: Iterable[str] = (), more: Iterable[str] = ()) -> None:
         """Make the workspace folder, and clear half-written files of killed runs out of it.
@@ -199,52 +167,18 @@ class Store:
         """
         result = self.current(stage)
         if result is None:
-            try:
-                read_record(self.root / stage / POINTER, Pointer)
-            except DamagedError as error:
-                raise RequestError(
-                    f"Which result of '{stage}' is in use is not known any more: "
-                    f"{self.root / stage / POINTER} is damaged ({error}). Run the command without "
-                    "--stages and --from and with the photographs named: every result that is "
-                    "there is used again."
-                ) from error
+            self._pointers.require(stage)
         return result
 
     def pointer(self, stage: str) -> dict[str, Any] | None:
-        """What `current.json` says: the key in use and why it came to be.
-
-        Where it is not what was written, the only result there is is the one in use.
-        """
-        path = self.root / stage / POINTER
-        try:
-            pointer = read_record(path, Pointer)
-        except DamagedError as error:
-            self._say(f"{path} is damaged ({error}); it will be written anew.")
-            return self._only_one(stage)
-        return pointer.model_dump() if pointer else None
-
-    def _only_one(self, stage: str) -> dict[str, Any] | None:
-        keys = []
-        for path in (self.root / stage).glob(f"*/{MANIFEST}"):
-            with suppress(DamagedError):
-                keys.append((read_manifest(path) or {}).get("key", ""))
-        keys = [key for key in keys if isinstance(key, str) and self.folder(stage, key).is_dir()]
-        return {"key": keys[0], "reasons": []} if len(keys) == 1 else None
+        """What `current.json` says: the key in use and why it came to be."""
+        return self._pointers.read(stage)
 
     def use(self, result: Result, reasons: list[str] | None = None) -> None:
         """Make a result the one in use."""
-        folder = self.root / result.stage
-        pointer = {"key": result.key, "reasons": reasons or []}
-        try:
-            found = read_record(folder / POINTER, Pointer)
-        except DamagedError:
-            found = None
-        if found is None or found.model_dump() != pointer:
-            if is_folder(folder / POINTER):
-                set_aside(folder / POINTER)
-            write_sealed(folder / POINTER, pointer)
-        remove(folder / FAILURE)
-        remove(folder / EVIDENCE)
+        self._pointers.write(result.stage, result.key, reasons or [])
+        remove(self.root / result.stage / FAILURE)
+        remove(self.root / result.stage / EVIDENCE)
 
     def quarantine(self, stage: str, folder: Path, why: str = "") -> None:
         """Move a damaged result aside. It is kept for inspection until the next `clean`."""

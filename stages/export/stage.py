@@ -14,7 +14,7 @@ from pipeline.stage import Parts, Stage, StageContext
 from stages.export.config import ExportConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pipeline.artifacts.cameras import Cameras
     from pipeline.artifacts.dental.fdi import Jaw
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pipeline.artifacts.views import Views
     from stages.export.measuring.mouth import Mouth
     from stages.export.mesh.surface import Mesh
+    from stages.export.mesh.texture.sight import Sight
     from stages.export.scene import Scene
     from stages.export.viewer.page import Knowledge
 
@@ -32,7 +33,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 8
+    version = 9
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -61,6 +62,8 @@ class ExportStage(Stage):
         from pipeline.artifacts.space.scale import NO_SCALE
         from stages.export.beside import Beside
         from stages.export.mesh.building import build_mesh
+        from stages.export.mesh.jaws import crown_maps, jaws_of
+        from stages.export.mesh.texture.sight import sights
         from stages.export.scene import assemble
         from stages.export.splatfiles.writing import write_splats
 
@@ -107,13 +110,20 @@ class ExportStage(Stage):
                     config.mesh_faces, context.progress,
                 )  # fmt: skip
                 context.progress("mesh", 1, 1)
+            seen: Sequence[Sight] = ()
+            jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
+            if mesh is not None:
+                seen = sights(mesh, scene.cameras, scene.masks)
+                if mouth is not None:
+                    jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
             if config.viewer:
-                known = _knowledge(scene, frame, scale, mouth, teeth, mesh)
+                known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)
                 page = beside.give(_write_page, context, scene, folder, known)
             if mesh is not None:
                 beside.give(
-                    _write_mesh, context, cameras, scene, mesh, mouth, folder, frame, scale, skipped
-                )
+                    _write_mesh, context, cameras, scene, mesh, seen, jaws, folder, frame, scale,
+                    skipped,
+                )  # fmt: skip
             elif config.mesh:
                 skipped["mesh"] = "too little surface for a mesh"
                 context.warn(
@@ -139,24 +149,19 @@ class ExportStage(Stage):
 
 
 def _write_mesh(
-    context: StageContext, cameras: Cameras, scene: Scene, mesh: Mesh, mouth: Mouth | None,
-    folder: Path, frame: Frame, scale: Scale, skipped: dict[str, str],
+    context: StageContext, cameras: Cameras, scene: Scene, mesh: Mesh, seen: Sequence[Sight],
+    jaws: Mapping[Jaw, npt.NDArray[np.bool_]], folder: Path, frame: Frame, scale: Scale,
+    skipped: dict[str, str],
 ) -> None:  # fmt: skip
     """The mesh together and jaw by jaw, with colours, for slicers, with a texture, as models."""
-    from stages.export.mesh.jaws import crown_maps, jaws_of
     from stages.export.mesh.texture.atlas import textured
-    from stages.export.mesh.texture.sight import sights
     from stages.export.mesh.writing import Writer, write_meshes, write_models
 
     config: ExportConfig = context.config
-    seen = sights(mesh, scene.cameras, scene.masks)
     colored = None
     if config.mesh_texture:
         photos = [scene.photos[camera.name] for camera in scene.cameras]
         colored = textured(mesh, seen, photos, config.mesh_texture)
-    jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
-    if mouth is not None and (config.mesh_jaws or config.mesh_base):
-        jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
     writer = Writer(folder, frame, scale)
     write_meshes(writer, mesh, colored, jaws if config.mesh_jaws else {})
     if config.mesh_base:
@@ -221,32 +226,32 @@ def _write_teeth(
 
 def _knowledge(
     scene: Scene, frame: Frame, scale: Scale, mouth: Mouth | None,
-    teeth: dict[str, Any] | None, mesh: Mesh | None,
+    teeth: dict[str, Any] | None, mesh: Mesh | None, jaws: Mapping[Jaw, npt.NDArray[np.bool_]],
 ) -> Knowledge:  # fmt: skip
     """What the viewer shows beside the scene."""
+    from stages.export.mesh.jaws import jaws_at
     from stages.export.texts import describe_frame
     from stages.export.viewer.knowledge import (
         coarse,
         directions,
-        jaws_of,
         photographs_that_saw,
         seen_surfaces,
     )
     from stages.export.viewer.page import Knowledge
 
     surfaces = seen_surfaces(scene.cameras, scene.seen, scene.masks)
-    dentitions = mouth.dentitions if mouth else {}
-    overlay = None
+    overlay, side = None, None
     if mesh is not None:
         vertices, faces = coarse(mesh.vertices, mesh.faces)
-        overlay = vertices, faces, jaws_of(vertices, surfaces, dentitions)
+        overlay = vertices, faces, jaws_at(vertices, mesh, jaws)
+        side = jaws_at(scene.gaussians.means, mesh, jaws)
     return Knowledge(
         scale=scale.as_dict(),
         frame=describe_frame(frame),
         teeth=directions(teeth["teeth"], scene.cameras) if teeth else (),
         measurements=mouth.measurements if mouth else (),
         axes=mouth.axes if mouth else None,
-        jaws=jaws_of(scene.gaussians.means, surfaces, dentitions),
+        jaws=side,
         seen=photographs_that_saw(scene.gaussians.means, surfaces),
         mesh=overlay,
     )

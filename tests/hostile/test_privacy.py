@@ -17,7 +17,7 @@ import av
 import pytest
 from PIL import Image
 
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.studies.report import run_report
 from tests.personal_data import PERSONAL
 

@@ -15,7 +15,7 @@ from pipeline.artifacts import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
 #: The folders of `stages/` that are no stages but what stages are made of.
-LIBRARIES = {"dentition", "pointmaps", "splatting", "stereo"}
+LIBRARIES = {"dentition", "photographs", "pointmaps", "splatting", "stereo"}
 #: The engine's parts that may know stages: the command line, and what is done with whole runs.
 ABOVE = ("pipeline.cli", "pipeline.front", "pipeline.studies")
 #: Modules on the floor of a folder at most.

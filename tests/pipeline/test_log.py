@@ -11,7 +11,8 @@ import pipeline
 from pipeline.errors import PipelineError, RequestError
 from pipeline.front import log
 from pipeline.front.progress import cost, make_reporter
-from pipeline.runner import Reporter, StageOutcome
+from pipeline.running.outcomes import StageOutcome
+from pipeline.running.reporter import Reporter
 from pipeline.workspace import read_request
 
 

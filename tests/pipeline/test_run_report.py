@@ -12,7 +12,8 @@ import pytest
 import pipeline
 from pipeline.cli import app
 from pipeline.config import load_config
-from pipeline.runner import Reporter
+from pipeline.running.outcomes import RunSummary
+from pipeline.running.reporter import Reporter
 
 
 class Listener(Reporter):
@@ -23,7 +24,7 @@ class Listener(Reporter):
         self.heard.append(text)
 
 
-def start(toys: Path, *overrides: str, **options: Any) -> pipeline.runner.RunSummary:  # type: ignore[name-defined]
+def start(toys: Path, *overrides: str, **options: Any) -> RunSummary:
     return pipeline.run(
         toys / "images", workspace=toys / "w", preset=toys / "toy.yaml", overrides=overrides,
         **options,

@@ -14,6 +14,7 @@ from toy import STAGES, ToyEntryPoint, artifact_bytes
 
 import pipeline
 from pipeline.artifacts.views import read_png
+from pipeline.running.reporter import Reporter
 from pipeline.stage import Stage, StageConfig, StageContext
 from pipeline.store import Store
 
@@ -129,7 +130,7 @@ def test_a_stage_that_runs_unasked_sees_what_it_saw_before(
     assert run(stages=["publish"]) == cached
 
 
-class Ears(pipeline.runner.Reporter):
+class Ears(Reporter):
     def __init__(self) -> None:
         self.heard: list[str] = []
 

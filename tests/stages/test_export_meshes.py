@@ -17,7 +17,7 @@ from pipeline.artifacts.teeth import Teeth
 from pipeline.stage import LocalContext
 from stages.dentition.crowns import Outline, dentition_of
 from stages.export.mesh.bend import bent
-from stages.export.mesh.jaws import jaws_of
+from stages.export.mesh.jaws import LOWER, NEITHER, UPPER, jaws_at, jaws_of
 from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.solid import _field, border_vertices, closed, is_closed, well_composed
 from stages.export.mesh.surface import Mesh
@@ -140,6 +140,10 @@ def test_gums_go_with_the_nearest_crowns() -> None:
     assert jaws["upper"][height < -0.15].all() and jaws["lower"][height > 0.1].all()
     assert jaws_of(mesh, seen, [np.maximum(crowns, 0)]) == {}, "one jaw is not two"
     assert jaws_of(mesh, seen, [None]) == {}
+    z = mesh.vertices[0, 2]
+    places = np.array([[0, -0.3, z], [0, 0.3, z + 0.01], [0, 0.3, z + 9], [np.nan, 0, z]])
+    assert jaws_at(places, mesh, jaws).tolist() == [UPPER, LOWER, NEITHER, NEITHER]
+    assert not jaws_at(places, mesh, {}).any()
 
 
 def arch() -> Mesh:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.fit.config import FitConfig, resolve
-from stages.fit.numerics.detail import APART, SHRINK, divide, noise_level, wide_axes, within
+from stages.fit.numerics.detail import APART, SHRINK, divide, wide_axes, within
 from stages.fit.parts.start import coarse_factors, reduction
 
 
@@ -67,18 +67,6 @@ def test_the_largest_errors_come_first() -> None:
     axes[:, 2] = False
     chosen = within(axes, np.array([1.0, 4.0, 3.0, 2.0]), 7)
     assert chosen.any(1).tolist() == [False, True, True, False]
-
-
-def test_noise_is_told_from_texture() -> None:
-    rng = np.random.default_rng(5)
-    v, u = np.mgrid[:120, :160].astype(np.float32)
-    smooth = np.stack([0.5 + 0.2 * np.sin(u / 17 + v / 23)] * 3)
-    smooth[:, 40:60, 40:90] = 0.9  # an edge is no noise
-    noisy = smooth + rng.normal(0, 0.02, smooth.shape[1:]).astype(np.float32)
-    everywhere = np.ones(smooth.shape[1:], np.float32)
-    assert noise_level(smooth, everywhere) < 0.001
-    assert noise_level(noisy, everywhere) == pytest.approx(0.02, rel=0.1)
-    assert noise_level(noisy, 0 * everywhere) == 0
 
 
 def test_a_start_from_more_points_for_larger_pictures() -> None:

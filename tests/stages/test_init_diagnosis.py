@@ -78,3 +78,24 @@ def test_linked_photographs_without_a_solution_contradict_each_other():
     found = evidence(edges=edges, linked=[(0, 1), (1, 2)])
     text = failure(Attempt(None, found, False, False), NAMES, Limits(3, 2.0))
     assert "contradict each other" in text
+
+
+def test_unsharp_photographs_are_said_first_and_not_called_too_far_apart():
+    edges = {(0, 1): two_view(30, 0.3), (1, 2): two_view(20, 0.3)}
+    attempt = Attempt(None, evidence(edges=edges), False, False)
+    text = failure(attempt, NAMES, Limits(3, 2.0), [0, 1, 2])
+    assert text.startswith("'right.jpg', 'front.jpg', 'left.jpg' are not sharp: shaken")
+    assert "share too little: 500 spots" in text
+    assert "degrees" not in text, "nor is a photograph between them asked for"
+    one = failure(attempt, NAMES, Limits(3, 2.0), [2])
+    assert one.startswith("'left.jpg' is not sharp")
+    assert one.count("more than 35 degrees") == 1, "of the pair that is sharp"
+
+
+def test_an_unsharp_photograph_that_is_left_out_is_called_so():
+    edges = {(0, 1): two_view(200), (1, 2): two_view(40, 0.3)}
+    found = evidence(edges=edges, linked=[(0, 1)])
+    (text,) = warnings_of(Attempt(solution([0, 1]), found, True, True), NAMES, [0, 2])
+    assert "'left.jpg' is not sharp" in text
+    assert "'right.jpg' is not sharp" not in text, "it was placed"
+    assert "more than 35 degrees" not in text

@@ -18,7 +18,7 @@ from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply, write_gaussians_ply
 from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.stage import LocalContext
 from stages.evaluate.stage import EvaluateConfig, EvaluateStage
 from stages.export.stage import ExportConfig, ExportStage

@@ -11,21 +11,15 @@ import pytest
 
 from stages.export.viewer.compact import Pack, morton_order, octahedral
 from stages.export.viewer.knowledge import (
-    LOWER,
-    NEITHER,
-    UPPER,
     coarse,
-    jaws_of,
     photographs_that_saw,
     seen_surfaces,
 )
 from stages.splatting.rendering import render
 from tests.stages import export_scene as scene
-from tests.stages.ball_teeth_case import teeth_of_ball
 
 
-def test_who_saw_what_and_which_jaw_it_is() -> None:
-    """Crowns at two places of a ball: what is around them is of their jaws, else of neither."""
+def test_who_saw_what() -> None:
     ball = scene.ball_gaussians()
     opaque = np.full_like(ball.logit_opacities, 6.0)
     ball = replace(ball, logit_opacities=opaque, log_scales=ball.log_scales + 0.2)
@@ -36,11 +30,6 @@ def test_who_saw_what_and_which_jaw_it_is() -> None:
     seen = photographs_that_saw(points, surfaces)
     assert seen[[0, 1, 3]].tolist() == [3, 3, 0]
     assert 1 <= seen[2] <= 3
-    dentitions = teeth_of_ball().by_name()
-    assert jaws_of(points[:3], surfaces, dentitions).tolist() == [UPPER, LOWER, NEITHER]
-    beside = np.concatenate([points[:3], points[1:2] * 0.6])  # inside: no photograph sees it
-    assert jaws_of(beside, surfaces, dentitions)[3] == LOWER
-    assert not jaws_of(points, surfaces, {}).any()
 
 
 @pytest.mark.parametrize("delta", [False, True])

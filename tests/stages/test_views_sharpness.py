@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.views.sharpness import SHARP, SIZES, best_size, sharpness
+from stages.photographs.noise import noise_level
+from stages.photographs.sharpness import UNSHARP, sharpness, weakest_direction
+from stages.views.sharpness import SHARP, SIZES, best_size
 from stages.views.working import Prepared
 
 
@@ -57,3 +59,42 @@ def test_more_photographs_are_smaller() -> None:
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_a_blank_picture_has_no_detail(level: int) -> None:
     assert sharpness(np.full((90, 120), level, np.float32)) == 0
+
+
+def test_noise_is_told_from_texture() -> None:
+    rng = np.random.default_rng(5)
+    v, u = np.mgrid[:120, :160].astype(np.float32)
+    smooth = 0.5 + 0.2 * np.sin(u / 17 + v / 23)
+    smooth[40:60, 40:90] = 0.9  # an edge is no noise
+    noisy = smooth + rng.normal(0, 0.02, smooth.shape).astype(np.float32)
+    everywhere = np.ones(smooth.shape, np.float32)
+    assert noise_level(smooth, everywhere) < 0.001
+    assert noise_level(noisy) == pytest.approx(0.02, rel=0.1)
+    assert noise_level(noisy, everywhere) == pytest.approx(0.02, rel=0.1)
+    assert noise_level(noisy, 0 * everywhere) == 0
+
+
+def shaken(grey: np.ndarray, length: int, degrees: float) -> np.ndarray:
+    """As if the camera had moved along a line while the shutter was open."""
+    across = np.zeros((length, length), np.float32)
+    across[length // 2] = 1 / length
+    turn = cv2.getRotationMatrix2D((length / 2 - 0.5, length / 2 - 0.5), degrees, 1.0)
+    kernel = cv2.warpAffine(across, turn, (length, length))
+    return np.asarray(cv2.filter2D(grey, cv2.CV_32F, kernel / kernel.sum()))
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 45, 90, 130])
+def test_a_shaken_camera_leaves_one_direction_empty(degrees: float) -> None:
+    sharp = scene(3, 512, 384)
+    assert weakest_direction(sharp) > 1.5 * UNSHARP
+    assert weakest_direction(shaken(sharp, 9, degrees)) < UNSHARP
+    assert weakest_direction(shaken(sharp, 31, degrees)) < UNSHARP
+
+
+def test_out_of_focus_is_unsharp_in_all_directions_and_noise_does_not_hide_it() -> None:
+    rng = np.random.default_rng(4)
+    soft = cv2.GaussianBlur(scene(3, 512, 384), (0, 0), 2.5)
+    noisy = soft + rng.normal(0, 2, soft.shape).astype(np.float32)
+    assert weakest_direction(soft) < UNSHARP
+    assert weakest_direction(noisy) < UNSHARP
+    assert weakest_direction(np.full((90, 120), 128, np.float32)) == 0

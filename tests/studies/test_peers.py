@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.workspace import read_request
 
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "peers.py"

@@ -17,6 +17,7 @@ from pipeline.studies.register import comparing, movement, run_register, solving
 from pipeline.studies.register.comparing import compare_visits
 from pipeline.studies.register.frame import first_frame
 from pipeline.studies.register.visit import scale_of, textbook_scale
+from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import motion, toy_centres, toy_visit, write_visit
 
 MOVED = {
@@ -68,6 +69,15 @@ def test_intervals_hold_the_truth_and_say_who_moved(
 def test_the_scale_between_the_runs_comes_out(found: comparing.Comparison) -> None:
     assert found.relative_scale == pytest.approx(1 / 1.07, rel=2e-3)
     assert scale_of(found.first_from_second) == found.relative_scale
+
+
+def test_teeth_that_stood_still_lie_on_each_other_in_one_frame(
+    found: comparing.Comparison,
+) -> None:
+    frame = found.first_from_second
+    for number in found.still:
+        there = frame[:3, :3] @ found.second.centres[number] + frame[:3, 3]
+        assert np.linalg.norm(there - found.first.centres[number]) < 0.4, number
 
 
 def test_nothing_moved_says_so() -> None:
@@ -197,3 +207,122 @@ def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path
     (half / "request.json").write_text((workspaces[0] / "request.json").read_text())
     with pytest.raises(RequestError, match="finish the run first"):
         run_register(half, workspaces[1])
+
+
+PROBE = """
+(async () => {
+  await visits.ready;
+  const { pair } = visits;
+  const by = (id) => document.getElementById(id);
+  const sum = () => pair.pixels().reduce((total, value) => total + value, 0);
+  const half = (right) => {
+    const bytes = pair.pixels();
+    const { width, height } = pair.canvas;
+    let total = 0;
+    for (let y = 0; y < height; y++) {
+      for (let x = right ? width / 2 | 0 : 0; x < (right ? width : width / 2 | 0); x++) {
+        total += bytes[4 * (y * width + x)];
+      }
+    }
+    return total;
+  };
+  const drag = (target, from, to) => {
+    target.setPointerCapture = () => {};
+    target.hasPointerCapture = () => true;
+    const fire = (type, x) => target.dispatchEvent(new PointerEvent(type,
+      { pointerId: 3, clientX: x, clientY: 40, buttons: 1, bubbles: true, cancelable: true }));
+    fire("pointerdown", from);
+    for (let k = 1; k <= 5; k++) fire("pointermove", from + (to - from) * k / 5);
+    fire("pointerup", to);
+  };
+  const press = (key) => pair.canvas.dispatchEvent(
+    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+  const box = pair.canvas.getBoundingClientRect();
+  const told = { state: document.documentElement.dataset.scenes };
+  told.stills = getComputedStyle(document.querySelector(".stills")).display;
+  const slide = (value) => {
+    by("between").value = value;
+    by("between").dispatchEvent(new Event("input"));
+  };
+  slide(100);
+  told.first = [half(false), half(true)];
+  slide(0);
+  told.second = [half(false), half(true)];
+  slide(50);
+  told.wiped = [half(false), half(true)];
+  told.text = by("between").getAttribute("aria-valuetext");
+  by("fade").click();
+  told.faded = sum();
+  told.edge = by("edge").hidden;
+  by("wipe").click();
+  drag(by("edge"), box.left + box.width / 2, box.left + box.width * 0.8);
+  told.edgeAt = by("between").value;
+  press("[");
+  told.keyed = by("between").value;
+  by("swap").click();
+  told.swapped = by("between").value;
+  const before = sum();
+  drag(pair.canvas, box.left + 40, box.left + 140);
+  told.turned = sum() !== before;
+  told.pressed = by("places").querySelectorAll("[aria-pressed=true]").length;
+  press("r");
+  pair.motion && (pair.motion.start -= 1000);
+  told.back = sum() === before;
+  told.wide = [...document.querySelectorAll(".scroll")].map((e) => e.scrollWidth - e.clientWidth);
+  told.page = document.documentElement.scrollWidth - innerWidth;
+  told.named = [...by("live").querySelectorAll("button, input, canvas")].filter((e) => !e.hidden
+    && !(e.ariaLabel || e.textContent.trim() || e.labels?.length)).length;
+  tell(told);
+})().catch((error) => tell({ failed: String(error) }));
+"""
+
+
+@pytest.fixture(scope="module")
+def page(workspaces: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> str:
+    return run_register(*workspaces, tmp_path_factory.mktemp("page"))[0].read_text()
+
+
+@needs_chromium
+@pytest.mark.parametrize("size", [(1280, 900), (390, 780)])
+def test_both_scenes_are_live_under_one_slider(
+    page: str, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    told, log = run_in(page, PROBE, tmp_path, size)
+    assert "failed" not in told, told
+    assert log == []
+    assert told["state"] == "live"
+    assert told["stills"] == "none"
+    assert min(told["first"] + told["second"]) > 0
+    assert told["first"] != told["second"], "a tooth has moved"
+    assert told["wiped"] == pytest.approx([told["first"][0], told["second"][1]], rel=0.01)
+    assert told["text"] == "first visit on the left 50 %, second visit on the right 50 %"
+    assert told["faded"] > 0
+    assert told["edge"] is True
+    assert told["edgeAt"] == "80"
+    assert told["keyed"] == "75"
+    assert told["swapped"] == "0"
+    assert told["turned"] is True
+    assert told["pressed"] == 0
+    assert told["back"] is True
+    assert told["wide"] == [0], "the table is cut off"
+    assert told["page"] <= 0
+    assert told["named"] == 0
+
+
+@needs_chromium
+def test_without_webgl_the_pictures_stay(page: str, tmp_path: Path) -> None:
+    blind = page.replace(
+        "<head>",
+        "<head><script>HTMLCanvasElement.prototype.getContext = () => null;</script>",
+        1,
+    )
+    script = """visits.ready.then(() => tell({
+      state: document.documentElement.dataset.scenes, live: document.getElementById("live").hidden,
+      stills: getComputedStyle(document.querySelector(".stills")).display,
+      why: document.documentElement.dataset.problem }));"""
+    told, log = run_in(blind, script, tmp_path, (1280, 900))
+    assert log == []
+    assert told["state"] == "pictures"
+    assert told["live"] is True
+    assert told["stills"] == "grid"
+    assert "WebGL2" in told["why"]

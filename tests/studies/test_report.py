@@ -17,7 +17,7 @@ from pipeline.geometry.world import move_camera
 from pipeline.pages.directions import movement, similarity_onto
 from pipeline.pages.pictures import picture, points_image, thirds
 from pipeline.pages.tables import views_table
-from pipeline.runner import RunSummary
+from pipeline.running.outcomes import RunSummary
 from pipeline.studies.report import run_report
 from stages.evaluate.images.pictures import comparison
 from stages.flow.report import flow_colors

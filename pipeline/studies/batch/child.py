@@ -23,7 +23,8 @@ from pipeline.front.commands import run
 from pipeline.front.progress import LineReporter
 from pipeline.measure import peak_mb_with_children
 from pipeline.process.privacy import kept_for, private_from_now_on
-from pipeline.runner import Reporter, RunSummary
+from pipeline.running.outcomes import RunSummary
+from pipeline.running.reporter import Reporter
 from pipeline.store import is_disk_full
 from pipeline.store.locks import lock_of
 from pipeline.store.places import is_there, size_of

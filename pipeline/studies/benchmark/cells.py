@@ -13,7 +13,8 @@ from pipeline.config import load_config
 from pipeline.errors import PipelineError, RequestError, StageError
 from pipeline.front.commands import run
 from pipeline.planning import PlannedStage
-from pipeline.runner import Reporter, Runner
+from pipeline.runner import Runner
+from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
 from pipeline.store import Result, read_own
 from pipeline.store.places import remove

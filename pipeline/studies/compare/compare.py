@@ -15,7 +15,7 @@ from pipeline.files import write_atomic, write_json
 from pipeline.measure import usable_cores
 from pipeline.pages.page import REPORT
 from pipeline.process.privacy import kept_for, share_for
-from pipeline.runner import Reporter
+from pipeline.running.reporter import Reporter
 from pipeline.store import CorruptResultError, Result, Store
 from pipeline.store.places import stage_folder
 from pipeline.studies.compare import clouds, evidence, poses

@@ -10,7 +10,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.front.commands import run
-from pipeline.runner import Reporter
+from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
 from pipeline.store import Result, Store
 from pipeline.workspace import read_request

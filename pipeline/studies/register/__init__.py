@@ -25,7 +25,7 @@ def run_register(
     from pipeline.errors import RequestError
     from pipeline.studies.register.comparing import compare_visits
     from pipeline.studies.register.movement import words
-    from pipeline.studies.register.page import write_register_page
+    from pipeline.studies.register.page.writing import write_register_page
     from pipeline.studies.register.visit import read_visit
     from pipeline.studies.register.writing import write_files
 

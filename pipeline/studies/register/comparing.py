@@ -10,7 +10,6 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ReconstructionError
-from pipeline.geometry.similarity import camera_similarity
 from pipeline.studies.register import solving
 from pipeline.studies.register.estimate import Estimate, estimate
 from pipeline.studies.register.frame import first_frame
@@ -133,14 +132,8 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
     teeth = tuple(_teeth(first, there, _mirrored(back, there), factor))
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
-    looks = np.array([look.camera.cam_from_world for look in second.looks])
-    placed = np.array([camera.cam_from_world for camera in there.state.cameras])
-    joint = frame
-    if len(looks) > 1:
-        lever = float(np.median([np.median(k.depth[k.labels > 0]) for k in second.looks]))
-        scale, rotation, shift = camera_similarity(looks, placed, lever)
-        joint = np.eye(4)
-        joint[:3, :3], joint[:3, 3] = scale * rotation, shift
+    # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
+    joint = refined_frame(first, second, frame, there.still)
     surer = first if first.scale_percent <= second.scale_percent else second
     return Comparison(
         first, second, joint, teeth, tuple(sorted(missing)), likeness, share,

@@ -1,4 +1,4 @@
-"""Which part of a mesh belongs to which jaw, by the crowns in the photographs."""
+"""Which jaw everything belongs to, by the crowns in the photographs and the surface between."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ FEWEST_VERTICES, FEWEST_FACES = 30, 100
 BORDER = 1
 #: How often the border between the jaws is evened out.
 EVENINGS = 6
+#: What lies farther from the mesh than this share of its diagonal is of no jaw.
+OFF = 0.04
+NEITHER, UPPER, LOWER = 0, 1, 2
 #: A piece smaller than this share of its jaw's largest that touches the other jaw belongs to that.
 SMALLEST_PIECE = 0.02
 
@@ -97,6 +100,32 @@ def jaws_of(mesh: Mesh, seen: Sequence[Sight], maps: Sequence[Signs | None]) -> 
     if min(upper.sum(), (~upper).sum()) < FEWEST_FACES:
         return {}
     return {"upper": upper, "lower": ~upper}
+
+
+def jaws_at(
+    points: npt.NDArray[np.floating], mesh: Mesh, jaws: Mapping[Jaw, Bools]
+) -> npt.NDArray[np.uint8]:
+    """[N] the jaw of the mesh beside each point [N, 3]: `NEITHER`, `UPPER` or `LOWER`.
+
+    Args:
+        points: in the world of the mesh.
+        mesh: that was divided.
+        jaws: what `jaws_of` says of it.
+    """
+    found = np.full(len(points), NEITHER, np.uint8)
+    if not jaws:
+        return found
+    votes = np.zeros(len(mesh.vertices), np.int64)
+    for jaw, sign in zip(JAWS, (1, -1), strict=True):
+        np.add.at(votes, mesh.faces[jaws[jaw]].ravel(), sign)
+    known = np.flatnonzero(votes)
+    within = OFF * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    finite = np.flatnonzero(np.isfinite(points).all(1))
+    tree = cKDTree(mesh.vertices[known])
+    away, nearest = tree.query(points[finite], distance_upper_bound=within)
+    near = np.isfinite(away)
+    found[finite[near]] = np.where(votes[known[nearest[near]]] > 0, UPPER, LOWER)
+    return found
 
 
 def _edges(mesh: Mesh) -> csr_matrix:

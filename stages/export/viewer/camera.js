@@ -48,6 +48,16 @@ function orthonormal(R) {
   return [...x, ...cross(z, x), ...z];
 }
 
+/**
+ * The same camera in another frame, where points are scale * rotation * x + translation.
+ * @param {Pose} pose @param {{rotation: number[], translation: number[], scale: number}} similarity
+ */
+function carried(pose, { rotation: turn, translation: shift, scale }) {
+  const rotation = product(pose.rotation, transposed(turn));
+  const translation = minus(scaled(pose.translation, scale), applied(rotation, shift));
+  return { ...pose, rotation, translation };
+}
+
 /** The pose that shows the mirror image's place: reflected in a plane through `point`. */
 function mirrored(pose, point, normal) {
   const over = (vector) => minus(vector, scaled(normal, 2 * dot(vector, normal)));

@@ -65,17 +65,10 @@ function addButtons(viewer) {
 /** Keys that work wherever the focus is but in fields: key -> what it does. */
 function keysOf(viewer, tools) {
   const { store } = viewer;
-  const turn = (azimuth, elevation) => { viewer.camera.orbit(azimuth, elevation); viewer.leave(); };
-  const pan = (x, y) => { viewer.camera.pan(x, y); viewer.leave(); };
-  const zoom = (factor) => { viewer.camera.zoom(factor); viewer.leave(); };
   const toggle = (key) => () => tools.show({ [key]: !store.now[key] });
   const cut = (step) => tools.show({ at: clamp(store.now.at + step, -1, 1) });
   return {
-    ArrowLeft: (shift) => (shift ? pan(0.03, 0) : turn(-0.05, 0)),
-    ArrowRight: (shift) => (shift ? pan(-0.03, 0) : turn(0.05, 0)),
-    ArrowUp: (shift) => (shift ? pan(0, 0.03) : turn(0, 0.05)),
-    ArrowDown: (shift) => (shift ? pan(0, -0.03) : turn(0, -0.05)),
-    "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
+    ...steeringKeys(viewer),
     a: () => toggleTurn(viewer), b: () => viewer.nextBackground(), f: toggleFullScreen,
     h: () => showHelp(byId("help").hidden), "?": () => showHelp(byId("help").hidden),
     p: () => showPhoto(viewer, Number(byId("opacity").value) > 0 ? 0 : 100),

@@ -98,8 +98,8 @@ const CONSTANT_HARMONIC = 0.28209479177387814;
  */
 
 /** @returns {Promise<Splats>} */
-async function unpacked(text, format, centre) {
-  const { arrays, count, texels } = format;
+async function unpacked(text, format) {
+  const { arrays, centre, count, texels } = format;
   const columns = columnsOf(await inflated(text), arrays);
   const stride = 4 * texels;
   const packed = new Uint32Array(stride * count);

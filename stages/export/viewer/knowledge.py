@@ -1,17 +1,14 @@
-"""What the viewer knows of each place beside its colour: the jaw, and who saw it; and the mesh."""
+"""What the viewer knows of each place beside its colour: who saw it; the teeth; a small mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.teeth import Dentition, filled
 from stages.splatting.rendering import RenderedView
 from stages.splatting.support import SeenSurface, seen_surface, supporting_views
 
@@ -23,9 +20,6 @@ Floats = npt.NDArray[np.floating]
 SAME_SURFACE = 0.02
 #: Less opaque than this a pixel shows nothing.
 LEAST_ALPHA = 0.5
-NEITHER, UPPER, LOWER = 0, 1, 2
-#: A jaw reaches this many crowns' heights beyond the outlines: its gum, without lips and cheeks.
-GUM = 1.3
 #: Vertices of the mesh that lies over the scene, about.
 OVERLAY_VERTICES = 7000
 
@@ -49,54 +43,6 @@ def photographs_that_saw(points: Floats, surfaces: Sequence[SeenSurface]) -> Byt
     """[N] how many photographs saw each point [N, 3], at most 255."""
     counts = supporting_views(np.asarray(points, np.float64), surfaces, SAME_SURFACE)
     return np.minimum(counts, 255).astype(np.uint8)
-
-
-def jaw_map(dentition: Dentition) -> Bytes:
-    """[H, W] which jaw the nearest crown is of; `NEITHER` where it is far from all crowns."""
-    width, height = dentition.size
-    distances = []
-    for jaw in ("upper", "lower"):
-        crowns = dentition.crowns(jaw)
-        away = (~filled(crowns, dentition.size)).astype(np.uint8)
-        distances.append(
-            cv2.distanceTransform(away, cv2.DIST_L2, 5)
-            if crowns
-            else np.full((height, width), np.inf, np.float32)
-        )
-    tall = [np.linalg.norm(crown.zenith - crown.tip) for crown in dentition.all_crowns]
-    reach = GUM * float(np.median(tall)) if tall else 0.0
-    nearest = np.where(distances[0] <= distances[1], UPPER, LOWER)
-    return np.where(np.minimum(*distances) <= reach, nearest, NEITHER).astype(np.uint8)
-
-
-def jaws_of(
-    points: Floats, surfaces: Sequence[SeenSurface], dentitions: Mapping[str, Dentition]
-) -> Bytes:
-    """[N] the jaw of each point [N, 3]: what most photographs that see it say.
-
-    What no photograph sees is of the jaw of the nearest point that one sees.
-    """
-    votes = np.zeros((len(points), 3), np.int64)
-    for surface in surfaces:
-        dentition = dentitions.get(surface.camera.name)
-        if dentition is None or not dentition.all_crowns:
-            continue
-        jaws = jaw_map(dentition)
-        pixels, depth = surface.camera.project(points)
-        column, row = np.floor(pixels).astype(np.int64).T
-        inside = (depth > 0) & (column >= 0) & (column < jaws.shape[1])
-        inside &= (row >= 0) & (row < jaws.shape[0])
-        index = np.flatnonzero(inside)
-        there = surface.depth[row[index], column[index]]
-        shown = (there > 0) & (np.abs(there - depth[index]) < 1.5 * SAME_SURFACE * depth[index])
-        index = index[shown]
-        votes[index, jaws[row[index], column[index]]] += 1
-    found = votes.argmax(1).astype(np.uint8)
-    told = votes.any(1)
-    if told.any() and not told.all():
-        _, nearest = cKDTree(points[told]).query(points[~told])
-        found[~told] = found[told][nearest]
-    return found if told.any() else np.zeros(len(points), np.uint8)
 
 
 def coarse(

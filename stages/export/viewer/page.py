@@ -21,10 +21,13 @@ from stages.export.splats import PER_ROW, texels, used_degree, visible
 from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
 
 HERE = Path(__file__).parent
-SCRIPTS = (
-    "camera.js", "decode.js", "sort.js", "renderer.js", "mesh.js", "picking.js", "measuring.js",
-    "link.js", "viewer.js", "marks.js", "tools.js", "panel.js", "pointers.js", "controls.js",
-    "start.js",
+#: What shows a scene and lets one turn it, on any page; and what the viewer adds.
+SCENE_SCRIPTS = (
+    "camera.js", "decode.js", "sort.js", "renderer.js", "mesh.js", "screen.js", "steering.js",
+)  # fmt: skip
+VIEWER_SCRIPTS = (
+    "picking.js", "measuring.js", "link.js", "viewer.js", "marks.js", "tools.js", "panel.js",
+    "controls.js", "start.js",
 )  # fmt: skip
 SHADERS = (
     "splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl",
@@ -162,6 +165,68 @@ def build_page(
         The text of a self-contained HTML file: no names, no paths, no network.
     """
     known = knowledge or Knowledge()
+    described, splats = pack_scene(gaussians, orbit, rasterizer, sh_degree, known)
+    views = []
+    for camera in cameras:
+        view = describe_camera(camera)
+        if camera.name in photos:
+            view["photo"] = encode_jpeg(photos[camera.name], jpeg_quality)
+        views.append(view)
+    scene = {
+        "format": described,
+        "background": list(gaussians.background),
+        "orbiting": describe_orbit(orbit),
+        "views": views,
+        "first": orbit.middle(),
+        "scale": dict(known.scale),
+        "frame": dict(known.frame),
+        "teeth": list(known.teeth),
+        "measurements": list(known.measurements),
+        "axes": None if known.axes is None else known.axes.tolist(),
+        "knows": {
+            "jaws": known.jaws is not None and bool(known.jaws.any()),
+            "seen": known.seen is not None,
+        },
+        "shaders": shaders(),
+    }
+    parts = {
+        "styles": (HERE / "viewer.css").read_text(),
+        "scene": script_json(scene),
+        "splats": splats,
+        "scripts": scripts(*SCENE_SCRIPTS, *VIEWER_SCRIPTS),
+    }
+    page = (HERE / "viewer.html").read_text()
+    for key, text in parts.items():
+        page = page.replace("{{" + key + "}}", text, 1)
+    return page
+
+
+def scripts(*names: str) -> str:
+    """Scripts of this folder, one after the other."""
+    return "\n".join((HERE / name).read_text() for name in names)
+
+
+def shaders() -> dict[str, str]:
+    """GLSL by file name, as `SplatRenderer` takes it."""
+    return {name: (HERE / name).read_text() for name in SHADERS}
+
+
+def script_json(value: Any) -> str:
+    """JSON that nothing in it can end the script element of."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def pack_scene(
+    gaussians: Gaussians, orbit: Orbit, rasterizer: Mapping[str, float], sh_degree: int = 3,
+    known: Knowledge | None = None,
+) -> tuple[dict[str, Any], str]:  # fmt: skip
+    """What `unpacked` in decode.js reads: the format as JSON values, and the arrays as text.
+
+    Args:
+        gaussians, rasterizer, sh_degree, known: see `build_page`.
+        orbit: of the cameras, in the frame of the Gaussians.
+    """
+    known = known or Knowledge()
     shown = visible(gaussians, rasterizer["alpha_min"])
     light = gaussians.light
     kept = Gaussians(
@@ -177,39 +242,11 @@ def build_page(
     add_gaussians(pack, kept, degree, flags, orbit.centre, orbit.radius)
     if known.mesh is not None:
         add_mesh(pack, *known.mesh)
-    views = []
-    for camera in cameras:
-        view = describe_camera(camera)
-        if camera.name in photos:
-            view["photo"] = encode_jpeg(photos[camera.name], jpeg_quality)
-        views.append(view)
     carried = 1 if light else degree  # the shader takes a light's normals for harmonics
-    scene = {
-        "format": {
-            "count": len(kept), "sh_degree": carried, "texels": texels(carried),
-            "per_row": PER_ROW, "arrays": pack.described, "reach": orbit.radius,
-            "rasterizer": dict(rasterizer), "light": describe_light(light, orbit),
-        },
-        "background": list(gaussians.background),
-        "orbiting": describe_orbit(orbit),
-        "views": views,
-        "first": orbit.middle(),
-        "scale": dict(known.scale),
-        "frame": dict(known.frame),
-        "teeth": list(known.teeth),
-        "measurements": list(known.measurements),
-        "axes": None if known.axes is None else known.axes.tolist(),
-        "knows": {"jaws": bool(jaws.any()), "seen": known.seen is not None},
-        "shaders": {name: (HERE / name).read_text() for name in SHADERS},
+    described = {
+        "count": len(kept), "sh_degree": carried, "texels": texels(carried),
+        "per_row": PER_ROW, "arrays": pack.described, "reach": orbit.radius,
+        "centre": orbit.centre.tolist(), "knowsSeen": known.seen is not None,
+        "rasterizer": dict(rasterizer), "light": describe_light(light, orbit),
     }  # fmt: skip
-    parts = {
-        "styles": (HERE / "viewer.css").read_text(),
-        # Nothing in a JSON string can then close the script element.
-        "scene": json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),
-        "splats": pack.text(),
-        "scripts": "\n".join((HERE / name).read_text() for name in SCRIPTS),
-    }
-    page = (HERE / "viewer.html").read_text()
-    for key, text in parts.items():
-        page = page.replace("{{" + key + "}}", text, 1)
-    return page
+    return described, pack.text()

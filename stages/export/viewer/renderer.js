@@ -172,18 +172,25 @@ class SplatRenderer {
    * Draw a pane of the canvas: as many pixels as the pose has, from the pixel `left` on.
    * @param {Pose} pose @param {number[]} background rgb in 0..1
    * @param {{jaw: number, cut: number[], support: boolean, mesh: boolean}} shown
+   * @param {{pane: number, left: number, from: number, to: number, share: number}} where only the
+   *   pane's columns `from` to `to` are drawn, and mixed by `share` into what is there
    */
-  draw(pose, background, shown, pane = 0, left = 0) {
+  draw(pose, background, shown, { pane = 0, left = 0, from = 0, to = pose.width, share = 1 } = {}) {
     const gl = this.gl;
-    if (gl.isContextLost() || !this.orders[pane]) return;
+    if (gl.isContextLost() || !this.orders[pane] || to <= from || share <= 0) return;
     const { width, height } = pose;
     this.#resizeTarget(width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(from, 0, to - from, height);
     const mesh = shown.mesh && this.mesh
       ? this.mesh.draw(pose, this.format.rasterizer.near, shown) : null;
     this.#drawSplats(pose, shown, pane);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(left, 0, width, height);
-    gl.disable(gl.BLEND);
+    gl.scissor(left + from, 0, to - from, height);
+    gl.enable(gl.BLEND);
+    gl.blendColor(0, 0, 0, share);
+    gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
     gl.useProgram(this.screenProgram.handle);
     const u = this.screenProgram.uniforms;
     gl.activeTexture(gl.TEXTURE1);
@@ -196,6 +203,8 @@ class SplatRenderer {
     gl.bindVertexArray(this.noVertices);
     gl.uniform3fv(u.u_background, background);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
+    gl.disable(gl.SCISSOR_TEST);
   }
 
   #drawSplats(pose, shown, pane) {

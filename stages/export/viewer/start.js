@@ -73,10 +73,9 @@ function hookOf(viewer) {
 
 async function start() {
   const scene = JSON.parse(byId("scene").textContent);
-  scene.format.knowsSeen = scene.knows.seen;
   const text = byId("splats").textContent;
   byId("splats").remove();  // a megabyte and more
-  const splats = await unpacked(text, scene.format, scene.orbiting.centre);
+  const splats = await unpacked(text, scene.format);
   const viewer = new Viewer(scene, splats, new Store());
   const tools = new Tools(viewer);
   viewer.marks = new Marks(viewer);
@@ -84,7 +83,7 @@ async function start() {
   addViewButtons(viewer);
   addButtons(viewer);
   addKeys(viewer, tools);
-  addPointers(viewer, tools);
+  addPointers(viewer, (x, y) => tools.placeAt(x, y));
   viewer.goTo(scene.first, { still: true });
   readAddress(viewer, tools);
   viewer.render();

@@ -23,14 +23,13 @@ addEventListener("unhandledrejection", (event) => report(event.reason));
 
 const BACKGROUNDS = [[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]];
 
-class Viewer {
+class Viewer extends Screen {
   /** @param {object} scene as the page holds it @param {Splats} splats @param {Store} store */
   constructor(scene, splats, store) {
+    super(byId("canvas"), scene.orbiting);
     this.scene = scene;
     this.splats = splats;
     this.store = store;
-    this.canvas = byId("canvas");
-    this.camera = new OrbitCamera(scene.orbiting);
     this.renderer = new SplatRenderer(this.canvas, scene.format, splats, scene.shaders);
     this.positions = splats.positions;
     this.sorters = [this.#sorter(0)];
@@ -42,12 +41,6 @@ class Viewer {
     this.exact = null;      // a pose set through the hook
     this.view = -1;         // the photograph whose camera this is, or -1
     this.lens = scene.first;  // the photograph whose lens this is
-    this.motion = null;     // a running transition
-    this.turning = null;    // the running automatic turn
-    this.detail = 1;        // share of the screen's resolution while moving
-    this.lastFrame = 0;
-    this.moved = false;
-    this.asleep = true;
   }
 
   #sorter(pane) {
@@ -57,70 +50,17 @@ class Viewer {
     });
   }
 
-  /** Draw at the next frame; `moving` if the camera changed and so does the depth order. */
-  wake(moving = true) {
-    this.moved ||= moving;
-    if (!this.asleep) return;
-    this.asleep = false;
-    requestAnimationFrame((now) => this.#frame(now));
+  sort(panes) {
+    panes.forEach((pane, index) => {
+      this.sorters[index] ??= this.#sorter(index);
+      this.sorters[index].request(depthAxis(pane.pose));
+    });
   }
 
-  #frame(now) {
-    this.asleep = true;
-    const elapsed = now - this.lastFrame;
-    this.lastFrame = now;
-    const moving = this.#advance(now) || this.held;
-    this.#adapt(moving, elapsed);
-    const panes = this.panes();
-    if (this.moved) {
-      this.moved = false;
-      panes.forEach((pane, index) => {
-        this.sorters[index] ??= this.#sorter(index);
-        this.sorters[index].request(depthAxis(pane.pose));
-      });
-      this.settle && clearTimeout(this.settle);
-      this.settle = setTimeout(() => { this.detail < 1 && this.wake(false); }, 250);
-    }
-    this.#draw(panes);
-    if (this.motion || this.turning) this.wake(true);
-  }
-
-  /** On slow devices, move at a lower resolution and come to rest at the full one. */
-  #adapt(moving, elapsed) {
-    if (!moving || elapsed > 1000) {
-      this.shown = 1;
-      return;
-    }
-    if (elapsed > 45) this.detail = Math.max(0.4, this.detail * 0.85);
-    if (elapsed < 20) this.detail = Math.min(1, this.detail * 1.03);
-    this.shown = this.detail;
-  }
-
-  #advance(now) {
-    if (this.motion) {
-      const share = clamp((now - this.motion.start) / this.motion.length, 0, 1);
-      this.camera.blend(this.motion.from, this.motion.to, share * share * (3 - 2 * share));
-      if (share === 1) {
-        const { arrive } = this.motion;
-        this.motion = null;
-        arrive?.();
-      }
-      return true;
-    }
-    if (this.turning) {
-      const phase = (now - this.turning.start) / this.turning.period * 2 * Math.PI;
-      const { middle, reach, first } = this.turning;
-      const goal = middle + reach * Math.sin(first + phase);
-      this.camera.orbit(goal - this.camera.angles().azimuth, 0);
-      return true;
-    }
-    return false;
-  }
-
-  #draw(panes) {
+  draw(panes) {
     const shown = this.shownParts();
-    panes.forEach(({ pose, left }, index) => {
-      this.renderer.draw(pose, this.backdrop, shown, index, left);
+    panes.forEach(({ pose, left }, pane) => {
+      this.renderer.draw(pose, this.backdrop, shown, { pane, left });
     });
     this.#layPhoto(panes[0].pose);
     this.marks?.draw(panes);
@@ -158,11 +98,7 @@ class Viewer {
       this.canvas.height = this.exact.height;
       return [{ pose: this.exact, left: 0 }];
     }
-    const ratio = Math.min(devicePixelRatio || 1, 2) * (this.shown ?? 1);
-    const width = Math.max(2, Math.round(this.canvas.clientWidth * ratio));
-    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
-    if (this.canvas.width !== width) this.canvas.width = width;
-    if (this.canvas.height !== height) this.canvas.height = height;
+    const [width, height] = this.fitCanvas();
     const { below, beside } = this.#covered();
     const [strip, side] = [below * height, Math.round(beside * width)];
     if (!this.store.now.sides) {
@@ -218,25 +154,24 @@ class Viewer {
 
   /** Sort and draw at once, as things stand at this moment, at full resolution. */
   render() {
-    this.#advance(performance.now());
+    this.advance(performance.now());
     this.shown = 1;
     const panes = this.panes();
     panes.forEach(({ pose }, index) => {
       this.renderer.setOrder(backToFront(this.positions, depthAxis(pose)), index);
     });
-    this.#draw(panes);
+    this.draw(panes);
   }
 
   /** The user moved the camera: it is no longer that of a photograph. */
   leave() {
-    this.motion = null;
     this.exact = null;
     if (this.view >= 0) {
       this.view = -1;
       byId("opacity").value = 0;
       this.#announce();
     }
-    this.wake();
+    super.leave();
   }
 
   goTo(index, { still = false } = {}) {
@@ -244,20 +179,10 @@ class Viewer {
     if (!pose) return;
     this.stopTurning();
     this.exact = null;
-    const from = this.camera.snapshot();
-    this.camera.place(pose);
-    const to = this.camera.snapshot();
-    const arrive = () => this.camera.place(pose);  // free of rounding
     this.view = this.lens = index;
     if (pose.photo) byId("photo").src = pose.photo;
     this.#announce();
-    if (still || this.still || matchMedia("(prefers-reduced-motion: reduce)").matches) {
-      arrive();
-    } else {
-      this.camera.blend(from, to, 0);
-      this.motion = { from, to, arrive, start: performance.now(), length: 600 };
-    }
-    this.wake();
+    this.approach(pose, still);
   }
 
   #announce() {
@@ -298,7 +223,7 @@ class Viewer {
   }
 
   stopTurning() {
-    this.turning = null;
+    super.stopTurning();
     byId("turn").setAttribute("aria-pressed", false);
   }
 
@@ -319,5 +244,3 @@ class Viewer {
     });
   }
 }
-
-const depthAxis = (pose) => [...pose.rotation.slice(6, 9), pose.translation[2]];

@@ -1,8 +1,7 @@
-"""Gaussians in parts, and the noise of photographs."""
+"""Gaussians in parts."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from stages.fit.arrays import Array, Bools, Floats, Indices
@@ -11,26 +10,6 @@ from stages.fit.numerics.density import rotations
 #: halves of a Gaussian lie this many of its standard deviations from its middle, and are narrower
 #: by this factor: a little less wide together than it was, since what is split is to show more
 APART, SHRINK = 0.5, 0.6
-#: takes out what is even or linear, and multiplies the deviation of noise by the norm (Immerkaer
-#: 1996, "Fast Noise Variance Estimation")
-LAPLACE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-LAPLACE_NORM = 6.0
-#: median of absolute values to standard deviation, for a normal distribution
-MEDIAN_TO_SIGMA = 1 / 0.6745
-
-
-def noise_level(image: Floats, mask: Floats) -> float:
-    """Standard deviation of a photograph's noise, by the median: texture is no noise.
-
-    Args:
-        image: [3, H, W]; mask: [H, W] 1 where it counts.
-    """
-    grey = image.mean(0)
-    second = np.abs(cv2.filter2D(grey, cv2.CV_32F, LAPLACE))
-    inside = cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0
-    if not inside.any():
-        return 0.0
-    return float(np.median(second[inside])) * MEDIAN_TO_SIGMA / LAPLACE_NORM
 
 
 def wide_axes(packed: Floats, pixel: Floats, least: float) -> Bools:

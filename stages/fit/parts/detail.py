@@ -18,6 +18,7 @@ from stages.fit.parts.base import Figures, Part
 from stages.fit.parts.start import reduction
 from stages.fit.parts.surface import Surface
 from stages.fit.settings import AutoFloat, PartSettings, Positive, automatic
+from stages.photographs.noise import noise_level
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
@@ -108,7 +109,8 @@ def unexplained(fit: Trainer, factor: int, times: float, least: float) -> tuple[
         error = colour.target - image
         # what the camera clipped may be brighter
         error[(colour.target >= fit.settings.saturation) & (error < 0)] = 0
-        noise = max(times * numerics.detail.noise_level(colour.target, colour.mask), least)
+        own = noise_level(colour.target.mean(0), colour.mask)
+        noise = max(times * own, least)
         planes = np.zeros_like(rendering.planes)
         planes[0] = colour.mask
         planes[1] = ((error * error).mean(0) - np.float32(noise * noise)) * colour.mask

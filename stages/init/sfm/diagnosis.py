@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,12 +66,33 @@ def least_views(count: int, fraction: float) -> int:
     return count if count <= 3 else max(2, int(np.ceil(fraction * count)))
 
 
-def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
+def failure(
+    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int] = ()
+) -> str | None:
     """The diagnosis of an attempt as one paragraph, or None if the reconstruction is good.
 
     Args:
         names: how the user knows the photographs.
+        unsharp: those that are shaken or out of focus; that is said first.
     """
+    found = _failure(attempt, names, limits, unsharp)
+    if found is None or not unsharp:
+        return found
+    return f"{_too_soft([names[view] for view in unsharp])} {found}"
+
+
+def _too_soft(names: list[str]) -> str:
+    one = len(names) == 1
+    return (
+        f"{_listed(names)} {'is' if one else 'are'} not sharp: shaken, or out of focus, so that "
+        f"too little fine detail is left to match. Take {'it' if one else 'them'} again with the "
+        "camera held still, in better light, and focused on the teeth."
+    )
+
+
+def _failure(
+    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int]
+) -> str | None:
     if len(names) < 2:
         return (
             f"One photograph ({', '.join(names)}) can't give a 3D scene: at least two are needed, "
@@ -90,22 +112,23 @@ def failure(attempt: Attempt, names: list[str], limits: Limits) -> str | None:
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
-            f"{_gaps(evidence, names)} {_advice(attempt)}"
-        )
+            f"{_gaps(evidence, names, unsharp)} {_advice(attempt, names, unsharp)}"
+        ).rstrip()
     doubt = doubtful(solution, evidence, limits)
     if doubt:
         return f"{doubt} {HOW_TO_SHOOT}"
     if len(solution.poses) < limits.min_views:
         unplaced = [view for view in range(len(names)) if view not in solution.poses]
         reasons = " ".join(
-            _why_unplaced(evidence, names, view, set(solution.poses))
+            _why_unplaced(evidence, names, view, set(solution.poses), unsharp)
             for view in unplaced[:MOST_NAMED]
         )
         return (
             f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
             f"{limits.min_views} are needed. Not placed: "
-            f"{_listed([names[view] for view in unplaced])}. {reasons} {_advice(attempt)}"
-        )
+            f"{_listed([names[view] for view in unplaced])}. {reasons} "
+            f"{_advice(attempt, names, unsharp)}"
+        ).rstrip()
     return None
 
 
@@ -168,11 +191,12 @@ def _median_depth(solution: Solution) -> float:
     return float(np.median(np.concatenate(depths))) if depths else 0.0
 
 
-def warnings_of(attempt: Attempt, names: list[str]) -> list[str]:
+def warnings_of(attempt: Attempt, names: list[str], unsharp: Sequence[int] = ()) -> list[str]:
     """What the user should know of a reconstruction that stands: views left out, and a guess.
 
     Args:
         names: how the user knows the photographs.
+        unsharp: those that are shaken or out of focus.
     """
     solution = attempt.solution
     if solution is None:
@@ -180,8 +204,13 @@ def warnings_of(attempt: Attempt, names: list[str]) -> list[str]:
     unplaced = [view for view in range(len(names)) if view not in solution.poses]
     result = []
     if unplaced:
-        reasons = " ".join(_why_unplaced(attempt.evidence, names, view, set(solution.poses))
-                           for view in unplaced[:MOST_NAMED])  # fmt: skip
+        reasons = " ".join(
+            _why_unplaced(attempt.evidence, names, view, set(solution.poses), unsharp)
+            for view in unplaced[:MOST_NAMED]
+        )
+        soft = [names[view] for view in unplaced if view in unsharp]
+        if soft:
+            reasons = f"{_too_soft(soft)} {reasons}"
         result.append(
             f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
             f"{_listed([names[view] for view in unplaced])}. {reasons} {HOW_TO_BRIDGE}"
@@ -192,7 +221,9 @@ def warnings_of(attempt: Attempt, names: list[str]) -> list[str]:
     return result
 
 
-def _why_unplaced(evidence: Evidence, names: list[str], view: int, placed: set[int]) -> str:
+def _why_unplaced(
+    evidence: Evidence, names: list[str], view: int, placed: set[int], unsharp: Sequence[int]
+) -> str:
     """One sentence: why a photograph could not be placed beside those that are."""
     usual = float(np.median(evidence.keypoints))
     if evidence.keypoints[view] < BLURRED * usual:
@@ -211,10 +242,10 @@ def _why_unplaced(evidence: Evidence, names: list[str], view: int, placed: set[i
             f"'{names[view]}' matches '{other}' ({agreeing} spots agree), but contradicts the "
             "other photographs: something moved, or the zoom changed."
         )
-    return _link(evidence, names, pair)
+    return _link(evidence, names, pair, unsharp)
 
 
-def _gaps(evidence: Evidence, names: list[str]) -> str:
+def _gaps(evidence: Evidence, names: list[str], unsharp: Sequence[int]) -> str:
     """A sentence on each gap that keeps photographs apart: the best of the pairs across it."""
     group = groups(list(evidence.linked), len(names))
     sentences: list[str] = []
@@ -225,7 +256,7 @@ def _gaps(evidence: Evidence, names: list[str]) -> str:
             lone = [names[view] for view in range(len(names)) if group[view] != group[0]]
             sentences.append(f"{_listed(lone)} resemble none of the others.")
             break
-        sentences.append(_link(evidence, names, pair))
+        sentences.append(_link(evidence, names, pair, unsharp))
         old, new = group[pair[1]], group[pair[0]]
         group = [new if number == old else number for number in group]
     if sentences:
@@ -248,20 +279,23 @@ def _best_pair(evidence: Evidence, pairs: list[Pair]) -> Pair | None:
     )  # fmt: skip
 
 
-def _link(evidence: Evidence, names: list[str], pair: Pair) -> str:
-    """What a pair that does not link has, and how far apart it must be for that."""
+def _link(evidence: Evidence, names: list[str], pair: Pair, unsharp: Sequence[int]) -> str:
+    """What a pair that does not link has, and how far apart sharp ones are for that."""
     matches = evidence.matches[pair]
     edge = evidence.edges.get(pair)
     agreeing = len(edge.inliers) if edge else 0
     share = 100 * agreeing / max(matches, 1)
+    apart = f" They are probably more than {LINKED_UP_TO} degrees apart."
     return (
         f"'{names[pair[0]]}' and '{names[pair[1]]}' share too little: {matches} spots look alike, "
-        f"of which {agreeing} ({share:.0f} %) agree on where the camera stood. They are probably "
-        f"more than {LINKED_UP_TO} degrees apart."
+        f"of which {agreeing} ({share:.0f} %) agree on where the camera stood."
+        f"{'' if {*pair} & {*unsharp} else apart}"
     )
 
 
-def _advice(attempt: Attempt) -> str:
+def _advice(attempt: Attempt, names: list[str], unsharp: Sequence[int]) -> str:
+    if len(unsharp) == len(names):
+        return ""  # sharp ones come first
     return HOW_TO_BRIDGE if attempt.focal_known else f"{HOW_TO_BRIDGE} {HOW_TO_GIVE_FOCAL}"
 
 

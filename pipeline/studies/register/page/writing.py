@@ -1,4 +1,4 @@
-"""register.html: what moved, in a table, in colours, and both scenes under a slider."""
+"""What stands on the page, and the file."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from pipeline.pages.tables import Cell, Table, cell
 from pipeline.studies.register.comparing import Comparison, Moved
 from pipeline.studies.register.geometry import inverted
 from pipeline.studies.register.movement import OPPOSITE, PARTS, words
+from pipeline.studies.register.page.live import live_scenes
 from pipeline.studies.register.visit import Visit, in_frame
 from pipeline.studies.register.writing import FARTHEST, color_of
 
@@ -33,9 +34,10 @@ def write_register_page(found: Comparison, out: Path) -> Path:
     """Write the page into a folder."""
     certain = [tooth for tooth in found.teeth if tooth.certain]
     return write_page(
-        "pipeline.studies.register", "register.html", out / PAGE,
+        "pipeline.studies.register.page", "register.html", out / PAGE,
         title=f"{found.first.name} and {found.second.name}", found=found, certain=certain,
-        table=movement_table(found), scenes=scenes(found), tinted=tinted(found),
+        table=movement_table(found), scenes=scenes(found),
+        live=live_scenes(found, shown_cameras(found.first)), tinted=tinted(found),
         said=[(t.tooth, words(t.parts, t.half)) for t in certain], farthest=FARTHEST,
         still=", ".join(map(str, found.still)), missing=", ".join(map(str, found.missing)),
     )  # fmt: skip
@@ -43,11 +45,11 @@ def write_register_page(found: Comparison, out: Path) -> Path:
 
 def movement_table(found: Comparison) -> Table:
     """Per tooth what it did, each figure with half of its 95 % interval."""
-    head = ["tooth (FDI)", "Universal", "", "distance mm", "turn °"]
+    head = ["tooth (FDI)", "Universal", "state", "distance mm", "turn °"]
     head += [f"{a} / {b} mm" for a, b in zip(PARTS[:3], OPPOSITE[:3], strict=True)]
     head += [f"{name} °" for name in PARTS[3:]]
     rows = [_row(tooth) for tooth in found.teeth]
-    return Table(head, rows, caption="Bold: beyond the uncertainty.", sortable=True)
+    return Table(head, rows, caption="Bold: beyond the uncertainty.", sortable=True, stacked=True)
 
 
 def _row(tooth: Moved) -> list[Cell]:

@@ -1,10 +1,15 @@
-// Mouse and fingers on the scene.
+// Mouse, fingers and keys that move the camera of a `Screen`.
 
 /** A pointer that moves less than this, in pixels, is meant to stay. */
 const TREMBLE = 5;
 
-function addPointers(viewer, tools) {
-  const { canvas, camera } = viewer;
+/**
+ * @param {Screen} screen
+ * @param {(x: number, y: number) => void} tapped told where a pointer went down and up again
+ * @param {() => boolean} zooms whether the wheel is for the scene, not for the page
+ */
+function addPointers(screen, tapped = () => {}, zooms = () => true) {
+  const { canvas, camera } = screen;
   const pointers = new Map();
   const turnsPerScreen = () => Math.PI / Math.min(canvas.clientWidth, canvas.clientHeight);
   const slide = (x, y) => {
@@ -17,8 +22,8 @@ function addPointers(viewer, tools) {
     still = pointers.size === 0 && event.button <= 0 ? [event.clientX, event.clientY] : null;
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
-    viewer.stopTurning();
-    viewer.held = true;
+    screen.stopTurning();
+    screen.held = true;
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -38,23 +43,39 @@ function addPointers(viewer, tools) {
       slide(x / 2, y / 2);
     }
     pointers.set(event.pointerId, now);
-    viewer.leave();
+    screen.leave();
   });
   for (const kind of ["pointerup", "pointercancel"]) {
     canvas.addEventListener(kind, (event) => {
-      if (kind === "pointerup" && still && pointers.size === 1) tools.placeAt(...still);
+      if (kind === "pointerup" && still && pointers.size === 1) tapped(...still);
       still = null;
       pointers.delete(event.pointerId);
-      viewer.held = pointers.size > 0;
-      viewer.wake(false);
+      screen.held = pointers.size > 0;
+      screen.wake(false);
     });
   }
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
+    if (!zooms()) return;
     event.preventDefault();
-    viewer.stopTurning();
+    screen.stopTurning();
     const pixels = event.deltaY * (event.deltaMode === 1 ? 30 : 1);
     camera.zoom(Math.exp(clamp(pixels, -200, 200) * 0.0015));
-    viewer.leave();
+    screen.leave();
   }, { passive: false });
+}
+
+/** Keys that move the camera: key -> what it does. @param {Screen} screen */
+function steeringKeys(screen) {
+  const { camera } = screen;
+  const turn = (azimuth, elevation) => { camera.orbit(azimuth, elevation); screen.leave(); };
+  const pan = (x, y) => { camera.pan(x, y); screen.leave(); };
+  const zoom = (factor) => { camera.zoom(factor); screen.leave(); };
+  return {
+    ArrowLeft: (shift) => (shift ? pan(0.03, 0) : turn(-0.05, 0)),
+    ArrowRight: (shift) => (shift ? pan(-0.03, 0) : turn(0.05, 0)),
+    ArrowUp: (shift) => (shift ? pan(0, 0.03) : turn(0, 0.05)),
+    ArrowDown: (shift) => (shift ? pan(0, -0.03) : turn(0, -0.05)),
+    "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
+  };
 }

@@ -1,0 +1,1 @@
+"""What can be measured of a photograph by itself, for every stage that asks."""
