@@ -73,7 +73,7 @@ def test_everything_is_there_and_counted(exported: LocalContext, folder: Path) -
     assert set(description["files"]) == {
         "viewer.html", "preview.png", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl", "mesh.glb",
         "points.ply", "colmap", "transforms.json", "splats_constant_colour.ply",
-        "splats.compressed.ply", "splats.spz",
+        "splats.compressed.ply", "splats.sog", "splats.spz",
     }  # fmt: skip
     assert {path.name for path in folder.iterdir()} == {
         *description["files"], "scene.json", "README.txt",
