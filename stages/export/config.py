@@ -16,7 +16,7 @@ class ExportConfig(StageConfig):
     splat_files: bool = Field(
         True,
         description="write, beside splats.ply, the smaller files for other viewers: one of "
-        "constant colour, .spz and compressed .ply",
+        "constant colour, .sog, .spz and compressed .ply",
     )
     colmap: bool = Field(True, description="write the COLMAP model and transforms.json")
     colmap_points: int = Field(

@@ -3,14 +3,17 @@
 The exports share one frame: x right, y up, z towards the viewer. Files whose readers take another
 direction for up are turned:
 
-- 3DGS `.ply` and compressed `.ply`: SuperSplat and PlayCanvas turn them by 180 degrees about z when
-  they load them (`Transform.PLY` of @playcanvas/splat-transform), for scenes of 3DGS have y down.
-- `.stl`: slicers and CAD have z up and look along y.
+- 3DGS `.ply`, compressed `.ply` and `.sog`: SuperSplat and PlayCanvas turn them by 180 degrees
+  about z when they load them (`Transform.PLY` of @playcanvas/splat-transform), for scenes of 3DGS
+  have y down.
+- `.stl`: slicers and CAD have z up and look along y. Slicers take a file as it lies, so a model of
+  the upper jaw (`model_upper.stl`) is turned further, onto its base.
 
 Lengths in `.glb` are metres, as glTF wants it, where a millimetre is known.
 
 `.spz` declares x right, y up, z back, and MeshLab (`.ply` meshes) and glTF have y up and look along
--z: as it is. nerfstudio turns scenes upright itself, by the cameras.
+-z: as it is. splat-transform 3 and SuperSplat do not heed what `.spz` declares and show it upside
+down; there are three other files for them. nerfstudio turns scenes upright itself, by the cameras.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ Array = npt.NDArray[np.float64]
 #: y up -> z up, the front towards -y.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
+
+#: y up -> the upper side down, onto a printer's bed, the front towards -y.
+ON_ITS_BASE = np.diag([-1.0, 1.0, -1.0, 1.0]) @ Z_UP
 
 #: Millimetres -> metres.
 METRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
@@ -41,8 +47,10 @@ def file_from_frame(name: str, stands: bool, millimetres: bool = False) -> Array
     """
     if millimetres and name.endswith(".glb"):
         return METRES
-    if stands and name.startswith("splats") and name.endswith(".ply"):
+    if stands and name.startswith("splats") and name.endswith((".ply", ".sog")):
         return VIEWERS_PLY
+    if stands and name == "model_upper.stl":
+        return ON_ITS_BASE
     if stands and name.endswith(".stl"):
         return Z_UP
     return np.eye(4)

@@ -37,6 +37,17 @@ def visible(gaussians: Gaussians, alpha_min: float) -> npt.NDArray[np.bool_]:
     return finite & (opacities(gaussians) >= alpha_min)
 
 
+def opacity_bytes(gaussians: Gaussians) -> npt.NDArray[np.uint8]:
+    """[N] opacities of 0..255 as files of bytes have them: 1 to 254.
+
+    Readers turn them into logits, and those of 0 and 1 are infinite.
+    """
+    levels: npt.NDArray[np.uint8] = np.clip(np.rint(opacities(gaussians) * 255), 1, 254).astype(
+        np.uint8
+    )
+    return levels
+
+
 def opacities(gaussians: Gaussians) -> npt.NDArray[np.float64]:
     """[N] float64 in 0..1."""
     return 1.0 / (1.0 + np.exp(-gaussians.logit_opacities.astype(np.float64)))

@@ -38,6 +38,7 @@ DESCRIPTIONS = {
     "splats_constant_colour.ply": "the same for viewers that show one colour a Gaussian: the mean "
     "of what the photographs' cameras see",
     "splats.compressed.ply": "the same, small, for SuperSplat and PlayCanvas",
+    "splats.sog": "the same, smaller still, for SuperSplat and PlayCanvas",
     "splats.spz": "the same, small, for viewers that read Niantic's .spz",
     **_meshes(),
     "model_upper.stl": "upper jaw, closed and with a base, for printing",
@@ -58,9 +59,9 @@ with the reason.
 """
 
 MODELS = """
-Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print. Their
-outside is the mesh. The back and the base are made up, not measured: the photographs do not show
-them.
+Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print: both lie
+on their bases, so they do not bite together as mesh_upper.stl and mesh_lower.stl do. Their outside
+is the mesh. The back and the base are made up, not measured: the photographs do not show them.
 """
 
 README = """\
@@ -110,9 +111,9 @@ FRAMES: dict[str, tuple[str, str, str]] = {
     ),
 }
 TURNED = """\
-Two kinds of files are turned against that frame, as their readers expect it: splats*.ply by 180
-degrees about z, for SuperSplat, and .stl by 90 degrees about x, so that z is up. scene.json has the
-matrices.
+Two kinds of files are turned against that frame, as their readers expect it: splats*.ply and
+splats.sog by 180 degrees about z, for SuperSplat, and .stl by 90 degrees about x, so that z is up
+(model_upper.stl further, onto its base). scene.json has the matrices.
 """
 METRES = """\
 Lengths in .glb files are in metres, as their readers expect it; in all others in millimetres.

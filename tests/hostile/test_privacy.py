@@ -14,12 +14,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import av
+import numpy as np
 import pytest
 from PIL import Image
 
+import pipeline
 from pipeline.running.outcomes import RunSummary
+from pipeline.studies.dicom import write_dicom
 from pipeline.studies.report import run_report
-from tests.personal_data import PERSONAL
+from tests.personal_data import DATE, PERSONAL
 
 #: Runs of base64 that are long enough to hold a picture or a name.
 BASE64 = re.compile(rb"[A-Za-z0-9+/]{40,}={0,2}")
@@ -121,3 +124,38 @@ def test_texts_without_names(said: object, shown: object) -> None:
 
     places = {"Prognath_Anna_left.jpg": "002", "Prognath_Anna_left": "002", "Prognath": "[name]"}
     assert Secrets(places).hide(said) == shown
+
+
+PHOTOS = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
+#: A whole run in a few seconds, with all files but film and page of the scene.
+HASTY = {
+    "views.long_side": 256, "fit.iterations": 5, "export.mesh_resolution": 64,
+    "export.mesh_faces": 2000, "export.video": False,
+}  # fmt: skip
+
+
+def test_dicom_files_tell_of_nobody_anywhere(tmp_path: Path) -> None:
+    """Name, number, birth date, institution, private elements: in no byte of a workspace."""
+    pytest.importorskip("pydicom")
+    from tests.dicom_files import as_bytes, compressed
+
+    given = tmp_path / "study"
+    given.mkdir()
+    for number, photo in enumerate(sorted(PHOTOS.glob("*.jpg"))):
+        with Image.open(photo) as opened:
+            data = as_bytes(compressed(np.asarray(opened.convert("RGB")), "JPEG"))
+        (given / f"IM_{number:04d}").write_bytes(data)
+    dates = (DATE.replace(":", ""), DATE.replace(":", "-"))
+    assert set(dates[:1]) | set(PERSONAL) - {DATE} <= set(
+        told(given / "IM_0000", (*PERSONAL, *dates))
+    ), "else nothing would be tested"
+    run = pipeline.run(given, workspace=tmp_path / "w", overrides=HASTY)
+    run_report(run.workspace)
+    assert run.results is not None
+    written = write_dicom(run.workspace, run.workspace / "dicom", views=1)
+    assert not written.problems and "mesh.dcm" in written.files
+    files = [path for path in run.workspace.rglob("*") if path.is_file()]
+    kinds = {path.suffix for path in files}
+    assert {".log", ".html", ".glb", ".spz", ".sog", ".dcm", ".json"} <= kinds
+    secrets = (*PERSONAL, *dates)
+    assert {str(path): told(path, secrets) for path in files if told(path, secrets)} == {}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.space.scale import Scale
@@ -268,9 +269,18 @@ def test_the_stage_writes_each_jaw_and_models_of_both(tmp_path: Path) -> None:
         assert up * np.median(part.vertices[:, 1]) > 1
         model = trimesh.load(home / f"model_{jaw}.stl")
         assert model.is_watertight and model.is_winding_consistent and model.volume > 50
-        assert turned[f"model_{jaw}.stl"] == turned["mesh.stl"]
-        base = (up * model.vertices[:, 2]).max()  # z is up in .stl
+        # on a printer's bed: z up, the base down, the front (z of the frame) towards -y
+        base = -model.vertices[:, 2].min()
         assert base == pytest.approx((up * part.vertices[:, 1]).max() + 2, abs=0.05)
+        flat = (model.triangles_center[:, 2] < 0.05 - base) & (model.face_normals[:, 2] < -0.99)
+        assert model.area_faces[flat].sum() > 0.2 * np.prod(model.extents[:2]), "it lies on it"
+        frame_from_file = np.linalg.inv(turned[f"model_{jaw}.stl"])
+        np.testing.assert_allclose(frame_from_file[:3, :3] @ [0, -1, 0], [0, 0, 1])
+        np.testing.assert_allclose(frame_from_file[:3, :3] @ [0, 0, -1], [0, up, 0])
+        # back in the frame, the front of the model is the surface that was seen
+        back = model.copy().apply_transform(frame_from_file)
+        away, _ = cKDTree(back.vertices).query(part.vertices)
+        assert np.median(away) < 0.3, "no further than a voxel"
         textured_part = trimesh.load(home / f"mesh_{jaw}.glb").to_geometry()
         np.testing.assert_allclose(1e3 * textured_part.bounds, part.bounds, atol=1e-3)
     assert sum(len(part.faces) for part in parts.values()) == len(whole.faces)

@@ -1,5 +1,6 @@
 """The splat files for viewers that know less: what they hold, and how they look."""
 
+import gzip
 import shutil
 import subprocess
 from dataclasses import replace
@@ -8,21 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply, write_gaussians_ply
-from stages.export.orientation import Z_UP, file_from_frame
+from stages.export.orientation import ON_ITS_BASE, Z_UP, file_from_frame
 from stages.export.scene import assemble
 from stages.export.splatfiles.compressed import compressed_ply_bytes
 from stages.export.splatfiles.order import morton_order
 from stages.export.splatfiles.plain import LEAST_SEEN, with_constant_color
+from stages.export.splatfiles.sog import _palette, sog_bytes
 from stages.export.splatfiles.spz import spz_bytes
-from stages.export.splatfiles.writing import COMPRESSED, CONSTANT, FULL, SPZ, write_splats
+from stages.export.splatfiles.writing import COMPRESSED, CONSTANT, FULL, SOG, SPZ, write_splats
 from stages.splatting.frame import move_gaussians
 from stages.splatting.rendering import contributions, render, seen_colors
 from tests.stages import export_scene as scene
+from tests.stages.sog_file import read_sog
 from tests.stages.splat_files import read_compressed_ply, read_spz
 
 CAMERAS = scene.ball_cameras()
+READERS = {COMPRESSED: read_compressed_ply, SOG: read_sog, SPZ: read_spz}
 
 
 def one_sided(degree: int = 2) -> Gaussians:
@@ -104,7 +109,7 @@ def test_a_light_beside_the_lens_is_in_the_constant_colors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "least_db", "degree"), [(FULL, 60, 2), (COMPRESSED, 38, 2), (SPZ, 30, 2)]
+    ("name", "least_db", "degree"), [(FULL, 60, 2), (COMPRESSED, 38, 2), (SOG, 36, 2), (SPZ, 30, 2)]
 )
 def test_files_look_as_the_scene(folder: Path, name: str, least_db: float, degree: int) -> None:
     path, ball = folder / name, one_sided()
@@ -112,7 +117,7 @@ def test_files_look_as_the_scene(folder: Path, name: str, least_db: float, degre
         found, bands = Gaussians(**read_gaussians_ply(path)), degree
         assert len(PlyData.read(path)["vertex"].properties) == 62 - 21, "no empty third band"
     else:
-        found, bands = (read_spz if name == SPZ else read_compressed_ply)(path)
+        found, bands = READERS[name](path)
         assert path.stat().st_size < (folder / FULL).stat().st_size / 2
     assert bands == degree
     assert len(found) == len(ball)
@@ -125,14 +130,21 @@ def test_files_stand_as_their_readers_expect(folder: Path) -> None:
     highest, nearest = world[world[:, 1].argmin()], world[world[:, 2].argmin()]
     ply = Gaussians(**read_gaussians_ply(folder / FULL)).means
     shown = ply * [-1, -1, 1]  # SuperSplat turns it by 180 degrees about z
+    sog = read_sog(folder / SOG)[0].means * [-1, -1, 1]  # and this
     spz = read_spz(folder / SPZ)[0].means
-    for means in (shown, spz):  # y up, z towards the viewer, x as in the photographs
+    for means in (shown, sog, spz):  # y up, z towards the viewer, x as in the photographs
         top, front = means[means[:, 1].argmax()], means[means[:, 2].argmax()]
         np.testing.assert_allclose(top, highest * [1, -1, -1], atol=1e-3)
         np.testing.assert_allclose(front, nearest * [1, -1, -1], atol=1e-3)
     np.testing.assert_array_equal(Z_UP[:3, :3] @ [0, 1, 0], [0, 0, 1])
     np.testing.assert_array_equal(Z_UP[:3, :3] @ [0, 0, 1], [0, -1, 0])
-    np.testing.assert_array_equal(file_from_frame("splats.ply", False), np.eye(4))
+    np.testing.assert_array_equal(ON_ITS_BASE[:3, :3] @ [0, 1, 0], [0, 0, -1])
+    np.testing.assert_array_equal(ON_ITS_BASE[:3, :3] @ [0, 0, 1], [0, -1, 0])
+    for name in ("splats.ply", "splats.sog", "mesh.stl", "model_upper.stl"):
+        turn = file_from_frame(name, True)[:3, :3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3))
+        assert np.linalg.det(turn) == pytest.approx(1), "turned, not mirrored"
+        np.testing.assert_array_equal(file_from_frame(name, False), np.eye(4))
 
 
 def test_the_header_says_the_scale(folder: Path) -> None:
@@ -152,16 +164,18 @@ def test_any_number_of_any_degree(tmp_path: Path, count: int, degree: int) -> No
     )  # fmt: skip
     (tmp_path / "a.spz").write_bytes(spz_bytes(few, degree))
     (tmp_path / "a.ply").write_bytes(compressed_ply_bytes(few, degree))
-    for found, bands in (
-        read_spz(tmp_path / "a.spz"), read_compressed_ply(tmp_path / "a.ply")
+    (tmp_path / "a.sog").write_bytes(sog_bytes(few, degree))
+    for (found, bands), coarse in (
+        (read_spz(tmp_path / "a.spz"), 0.04), (read_compressed_ply(tmp_path / "a.ply"), 0.04),
+        (read_sog(tmp_path / "a.sog"), 0.1),  # codes are far from each other where values are few
     ):  # fmt: skip
         assert len(found) == count
         assert bands == degree or not count
         if count:
             np.testing.assert_allclose(found.means, few.means, atol=60 / 1023)
-            np.testing.assert_allclose(found.log_scales, few.log_scales, atol=0.04)
+            np.testing.assert_allclose(found.log_scales, few.log_scales, atol=coarse)
             np.testing.assert_allclose(found.sh[:, 0], few.sh[:, 0], atol=0.02)
-            np.testing.assert_allclose(found.sh[:, 1:], few.sh[:, 1:], atol=0.04)
+            np.testing.assert_allclose(found.sh[:, 1:], few.sh[:, 1:], atol=coarse)
             cosine = np.abs((found.quats_wxyz * few.quats_wxyz).sum(1))
             assert cosine.min() > 0.998  # .spz has 8 bits, and finds w from the rest
             np.testing.assert_allclose(found.logit_opacities, few.logit_opacities, atol=0.35)
@@ -180,17 +194,52 @@ def test_all_62_properties_where_nothing_else_is_asked(tmp_path: Path) -> None:
     assert len(PlyData.read(tmp_path / "a.ply")["vertex"].properties) == 62
 
 
+def test_no_reader_finds_an_infinite_logit(tmp_path: Path) -> None:
+    """A byte of 0 or 255 is an opacity of 0 or 1 to a reader, whose logit is infinite."""
+    ball = scene.ball_gaussians(3)
+    ball = replace(ball, logit_opacities=np.array([-30, 0, 30], np.float32))
+    (tmp_path / "a.ply").write_bytes(compressed_ply_bytes(ball, 0))
+    colors = PlyData.read(tmp_path / "a.ply")["vertex"]["packed_color"] & 255
+    spz = gzip.decompress(spz_bytes(ball, 0))[16 + 9 * 3 :][:3]
+    (tmp_path / "a.sog").write_bytes(sog_bytes(ball, 0))
+    sog = read_sog(tmp_path / "a.sog")[0].logit_opacities
+    assert colors.tolist() == list(spz) == [1, 128, 254]
+    np.testing.assert_allclose(1 / (1 + np.exp(-sog)) * 255, [1, 128, 254], atol=1e-3)
+
+
+def test_more_harmonics_than_a_palette_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that are nearly alike share an entry."""
+    random = np.random.default_rng(0)
+    kinds = random.normal(size=(16, 9)).astype(np.float32)
+    kind = np.concatenate([np.arange(16), random.integers(0, 16, 984)])
+    harmonics = kinds[kind] + random.normal(scale=0.001, size=(1000, 9)).astype(np.float32)
+    monkeypatch.setattr("stages.export.splatfiles.sog.MOST_BITS", 9)
+    palette, labels = _palette(harmonics)
+    assert len(palette) == 512
+    assert np.abs(palette[labels] - harmonics).mean() < 0.01
+    assert len(np.unique(labels)) == 512, "no entry is left unused"
+
+
 @pytest.mark.skipif(shutil.which("splat-transform") is None, reason="needs splat-transform (npm)")
-@pytest.mark.parametrize("name", [FULL, CONSTANT, COMPRESSED, SPZ])
+@pytest.mark.parametrize("name", [FULL, CONSTANT, COMPRESSED, SOG, SPZ])
 def test_playcanvas_reads_them(folder: Path, tmp_path: Path, name: str) -> None:
     out = tmp_path / "out.ply"
     subprocess.run(["splat-transform", folder / name, out], check=True, timeout=120)
-    theirs = read_gaussians_ply(out)["means"]
-    if name == SPZ:  # their .ply have y down
-        theirs = theirs * [1, -1, -1]
-        ours = read_spz(folder / name)[0].means
-    elif name == COMPRESSED:
-        ours = read_compressed_ply(folder / name)[0].means
-    else:
-        ours = read_gaussians_ply(folder / name)["means"]
-    np.testing.assert_allclose(theirs, ours, atol=1e-5)
+    theirs = Gaussians(**read_gaussians_ply(out))
+    ours = (
+        READERS[name](folder / name)[0]
+        if name in READERS
+        else Gaussians(**read_gaussians_ply(folder / name))
+    )
+    if name == SPZ and np.abs(theirs.means - ours.means).max() > 1e-3:
+        # version 2 turns what it reads, by 180 degrees about x; version 3 does not
+        theirs = move_gaussians(theirs, np.diag([1.0, -1, -1, 1]))
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-5)
+    np.testing.assert_allclose(theirs.log_scales, ours.log_scales, atol=1e-5)
+    # q and -q are one rotation, and an axis of an ellipsoid has no sign
+    axes = [Rotation.from_quat(np.roll(g.quats_wxyz, -1, 1)).as_matrix() for g in (theirs, ours)]
+    np.testing.assert_allclose(np.abs((axes[0] * axes[1]).sum(1)), 1, atol=1e-4)
+    assert np.isfinite(theirs.logit_opacities).all()
+    np.testing.assert_allclose(theirs.logit_opacities, ours.logit_opacities, atol=1e-4)
+    np.testing.assert_allclose(theirs.sh[:, 0], ours.sh[:, 0], atol=1e-5)
+    np.testing.assert_allclose(theirs.sh, ours.sh, atol=1 / 32 if name == COMPRESSED else 1e-5)

@@ -73,7 +73,7 @@ def test_everything_is_there_and_counted(exported: LocalContext, folder: Path) -
     assert set(description["files"]) == {
         "viewer.html", "preview.png", "orbit.mp4", "splats.ply", "mesh.ply", "mesh.stl", "mesh.glb",
         "points.ply", "colmap", "transforms.json", "splats_constant_colour.ply",
-        "splats.compressed.ply", "splats.spz",
+        "splats.compressed.ply", "splats.sog", "splats.spz",
     }  # fmt: skip
     assert {path.name for path in folder.iterdir()} == {
         *description["files"], "scene.json", "README.txt",
@@ -179,6 +179,26 @@ def test_nerfstudios_cameras_agree(folder: Path) -> None:
         assert np.linalg.det(opengl[:3, :3]) == pytest.approx(1)
         assert (frame["fl_x"], frame["fl_y"]) == (truth.fx, truth.fy)
         assert (frame["cx"], frame["cy"]) == (truth.cx, truth.cy)
+
+
+def test_nerfstudios_points_are_what_its_cameras_show(folder: Path) -> None:
+    """As its data parser has it: OpenGL's axes, and the points of `ply_file_path` as they are."""
+    transforms = json.loads((folder / "transforms.json").read_text())
+    cloud = open3d.io.read_point_cloud(str(folder / transforms["ply_file_path"]))
+    points, colors = np.asarray(cloud.points), np.asarray(cloud.colors)
+    for frame in transforms["frames"]:
+        world_from_camera = np.array(frame["transform_matrix"])
+        x, y, z = ((points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]).T
+        u = frame["fl_x"] * x / -z + frame["cx"]
+        v = frame["fl_y"] * -y / -z + frame["cy"]
+        picture = read_png(folder / frame["file_path"])
+        inside = (u >= 0) & (v >= 0) & (u < frame["w"]) & (v < frame["h"])
+        assert (z < 0).all() and inside.mean() > 0.9
+        shown = picture[v[inside].astype(int), u[inside].astype(int)] / 255
+        front = z[inside] > np.median(z)  # the other half is hidden
+        away = np.abs(shown - colors[inside])[front]
+        mixed = np.abs(shown - colors[inside][::-1])[front]
+        assert np.median(away) < 0.5 * np.median(mixed), "each has the colour of its own pixel"
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "mesh.stl"])

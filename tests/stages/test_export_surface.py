@@ -184,3 +184,13 @@ def test_the_files_open_elsewhere(tmp_path: Path) -> None:
     np.testing.assert_allclose(stl.get_surface_area(), ply.get_surface_area(), rtol=1e-5)
     data = (tmp_path / "mesh.stl").read_bytes()
     assert len(data) == 84 + 50 * len(mesh)
+
+
+def test_no_triangle_without_area_in_stl(tmp_path: Path) -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)  # two vertices lie in one place
+    write_stl(tmp_path / "a.stl", Mesh(vertices, faces, np.ones((4, 3), np.float32)))
+    data = (tmp_path / "a.stl").read_bytes()
+    assert int.from_bytes(data[80:84], "little") == 1 and len(data) == 84 + 50
+    corners = np.frombuffer(data, "<f4", 9, 84 + 12).reshape(3, 3)
+    np.testing.assert_array_equal(corners, vertices[:3])

@@ -63,6 +63,33 @@ def test_a_picture_and_a_mesh(tmp_path: Path) -> None:
     assert picture.SOPInstanceUID != mesh.SOPInstanceUID
 
 
+def test_all_meshes_are_in_the_axes_of_a_patient(tmp_path: Path) -> None:
+    """In the frame of a mouth y is up; files have z up, and one of them lies on its base."""
+    corners = np.array([[1, 2, 3], [5, 2, 3], [1, 9, 3]], np.float32)  # in the frame of the mouth
+    turns = {
+        "mesh.stl": [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
+        "model_upper.stl": [[-1, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 1]],
+    }
+    folder = workspace(tmp_path / "w")
+    for name, turn in turns.items():
+        moved = corners @ np.array(turn, np.float32)[:3, :3].T
+        triangle = np.zeros(1, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
+        triangle["corners"] = moved
+        data = stl(1)[:84] + triangle.tobytes()
+        (folder / "results" / name).write_bytes(data)
+    scene = {"scale": IN_MM.as_dict(), "frame": {"name": "mouth", "file_from_frame": turns}}
+    (folder / "results" / "scene.json").write_text(json.dumps(scene))
+    write_dicom(folder, tmp_path / "out", views=0)
+    for name in turns:
+        found = read(tmp_path / "out", f"{Path(name).stem}.dcm")
+        held = np.frombuffer(found.EncapsulatedDocument, "<f4", 9, 84 + 12).reshape(3, 3)
+        np.testing.assert_array_equal(
+            held, np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], 1)
+        )
+        assert found.ContentDescription.endswith("x left, y back, z head")
+        assert found.ModelModification == ("YES" if name.startswith("model") else "NO")
+
+
 def test_nobody_is_named_unless_asked(tmp_path: Path) -> None:
     folder = workspace(tmp_path / "Prognath_Anna")
     for name in write_dicom(folder, tmp_path / "none", views=0).files:

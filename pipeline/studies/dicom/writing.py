@@ -19,8 +19,16 @@ from pipeline.studies.dicom.objects import Picture, Solid, data_sets
 from pipeline.studies.dicom.written import Written
 from pipeline.workspace import is_workspace
 
-#: Surfaces whose names begin so are not as the reconstruction has them.
-_MODIFIED = ("closed", "print", "base")
+#: Surfaces whose names begin so are not as the reconstruction has them: closed, with a base.
+_MODIFIED = "model"
+#: The axes of frames that stand, once z is up: those of a patient in DICOM, where it is a mouth's.
+_Z_UP_AXES = {
+    "mouth": "x left, y back, z head",
+    "upright": "x right, y away, z up",
+}
+#: Bytes before the triangles of a binary STL, and their layout.
+_STL_HEAD = 84
+_TRIANGLE = np.dtype([("vectors", "<f4", (4, 3)), ("spare", "<u2")])
 
 
 def write_all(
@@ -41,8 +49,7 @@ def write_all(
             f"first: pipeline run -w {workspace}."
         )
     scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
-    frame = str(scene.get("frame", {}).get("axes", ""))
-    solids, left_out = _solids(results, scale, frame, unscaled)
+    solids, left_out = _solids(results, scale, scene.get("frame", {}), unscaled)
     pictures = [*_preview(results), *_views(workspace, views)]
     if not pictures and not solids:
         raise RequestError(
@@ -67,9 +74,13 @@ def write_all(
 
 
 def _solids(
-    results: Path, scale: Scale, frame: str, unscaled: bool
+    results: Path, scale: Scale, frame: dict[str, Any], unscaled: bool
 ) -> tuple[list[Solid], dict[str, str]]:
+    """The `.stl` files of an export, all in one frame, and what is left out and why."""
+    from stages.export.orientation import Z_UP
+
     found, left_out = [], {}
+    turned = frame.get("file_from_frame", {})
     for path in sorted(results.glob("*.stl")):
         measured = scale.unit == "mm" and "without_scale" not in path.name
         if not measured and not unscaled:
@@ -78,15 +89,28 @@ def _solids(
                 "--unscaled writes it all the same"
             )
             continue
-        modified = any(word in path.stem for word in _MODIFIED)
+        modified = path.stem.startswith(_MODIFIED)
         title = f"Surface from photographs, {scale.short}"[:64]
+        data, axes = path.read_bytes(), str(frame.get("axes", ""))
+        if path.name in turned:
+            data = _turned(data, Z_UP @ np.linalg.inv(np.array(turned[path.name], np.float64)))
+            axes = _Z_UP_AXES.get(frame.get("name", ""), axes)
         found.append(
             Solid(
-                f"{path.stem}.dcm", title, path.read_bytes(), measured,
-                scale.short if measured else "no scale", frame, modified,
+                f"{path.stem}.dcm", title, data, measured,
+                scale.short if measured else "no scale", axes, modified,
             )
         )  # fmt: skip
     return found, left_out
+
+
+def _turned(stl: bytes, turn: npt.NDArray[np.float64]) -> bytes:
+    """A binary STL, its normals and corners turned by a rotation [4, 4] about the origin."""
+    if np.array_equal(turn, np.eye(4)):
+        return stl
+    rows = np.frombuffer(stl, _TRIANGLE, offset=_STL_HEAD).copy()
+    rows["vectors"] = rows["vectors"] @ turn[:3, :3].T.astype(np.float32)
+    return stl[:_STL_HEAD] + rows.tobytes()
 
 
 def _preview(results: Path) -> list[Picture]:

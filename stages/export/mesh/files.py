@@ -72,16 +72,20 @@ def write_mesh_ply(path: Path, mesh: Mesh, comments: Iterable[str] = ()) -> None
 def write_stl(path: Path, mesh: Mesh, said: str = "") -> None:
     """Write binary STL (one unit of the file is one world unit; STL has no units).
 
+    Triangles of no area, with two corners in one place, are left out: readers drop them and say so.
+
     Args:
         said: for the header, which has room for some 65 letters: the scale, above all.
     """
-    normals = face_normals(mesh)
+    corners = mesh.vertices[mesh.faces].astype(np.float32)
+    solid = (corners != np.roll(corners, 1, 1)).any(2).all(1)
+    normals = face_normals(mesh)[solid]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     rows = np.zeros(
-        len(mesh.faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")]
+        len(normals), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")]
     )
     rows["normal"] = normals
-    rows["corners"] = mesh.vertices[mesh.faces]
+    rows["corners"] = corners[solid]
     text = f"dentalsplat {said}".strip().encode("ascii", "replace")[:STL_HEADER]
     header = text.ljust(STL_HEADER, b"\0") + np.array(len(rows), "<u4").tobytes()
     path.write_bytes(header + rows.tobytes())

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians, ply_comment
-from stages.export.splats import coefficients, opacities
+from stages.export.splats import coefficients, opacity_bytes
 from stages.splatting.rendering import CONSTANT_HARMONIC
 
 CHUNK = 256
@@ -43,7 +43,7 @@ def compressed_ply_bytes(gaussians: Gaussians, degree: int, comments: Iterable[s
     sizes = np.clip(gaussians.log_scales, -MOST_LOG_SCALE, MOST_LOG_SCALE)
     scales, low_s, high_s = _within(sizes)
     colors, low_c, high_c = _within(gaussians.sh[:, 0] * np.float32(CONSTANT_HARMONIC) + 0.5)
-    alpha = opacities(gaussians)[:, None]
+    alpha = opacity_bytes(gaussians)[:, None] / 255
     words = np.stack(
         [
             _packed(positions, (11, 10, 11)),

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splats import coefficients, opacities
+from stages.export.splats import coefficients, opacity_bytes
 
 MAGIC, VERSION = 0x5053474E, 2
 #: Colour bytes: (f_dc * this + .5) * 255.
@@ -51,7 +51,7 @@ def spz_bytes(gaussians: Gaussians, degree: int) -> bytes:
     quats *= np.where(quats[:, :1] < 0, -1.0, 1.0)
     parts = [
         positions,
-        _bytes(opacities(gaussians) * 255),
+        opacity_bytes(gaussians),
         _bytes((gaussians.sh[:, 0] * COLOR_SCALE + 0.5) * 255),
         _bytes((gaussians.log_scales + 10) * 16),
         _bytes((quats[:, 1:] + 1) * 127.5),
