@@ -193,8 +193,8 @@ def exact_visits(folder: Path, truth: dict[str, Any]) -> tuple[Visit, Visit]:
             looks.append(
                 Look(
                     Camera(photograph, width, height, *lens, pose),
-                    np.asarray(picture, np.float32) / 255, labels.reshape(shape), depth,
-                    np.ones(shape, bool),
+                    np.float32(1 / 255) * np.asarray(picture, np.float32),
+                    labels.reshape(shape), depth, np.ones(shape, bool),
                 )
             )  # fmt: skip
         visits.append(Visit(f"exact_{name}", tuple(looks), teeth_points(looks), 1.0, "the truth"))
