@@ -44,6 +44,7 @@ OPTIONAL = {
 SYSTEM_LIBRARIES = {
     "usb-1.0": "libusb-1.0-0",
     "GL": "libgl1",
+    "OpenGL": "libopengl0",
     "X11": "libx11-6",
     "gomp": "libgomp1",
 }

@@ -28,18 +28,18 @@ def rasterizer() -> None:
 
 
 def whole_fits() -> None:
-    """A whole fit on a held surface with a light, and one without either."""
+    """Whole fits: on a held surface with a light and without, and with neither."""
     use_threads(1)
     image, valid = _image()[..., 0], np.ones((HEIGHT, WIDTH), np.float32)
     colour = ColourLoss(np.ascontiguousarray(np.stack([image] * 3)), valid)
     colour(colour.target, 0.2)
     planes, seen = np.ones((2, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
     flow_loss(planes, seen, planes, seen, 1.0, planes.copy(), seen.copy())
-    for held in (True, False):
+    for held, light in ((True, "camera"), (True, "none"), (False, "none")):
         names = [f"{k:03}" for k in range(3)]
         cameras = [_camera(k) for k in range(3)]
         config = FitConfig(
-            iterations=8, initial_points=POINTS, light="camera" if held else "none",
+            iterations=8, initial_points=POINTS, light=light,
             densify=not held, lambda_depth=0.1, hold_colors_until=0.0,
             backend="cpu",
         )  # fmt: skip

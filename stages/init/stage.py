@@ -40,7 +40,7 @@ class InitStage(Stage):
     provides = ("cameras", "points", "pointmaps")
     may_provide = ("views", "pictures", "teeth")  # undistorted; matches or labels; numbered
     libraries = ("pycolmap", "opencv-contrib-python-headless", "numpy", "scipy", "numba")
-    rehearsals = ("stages.init.rehearsal:everything",)
+    rehearsals = ("stages.init.rehearsal:teeth", "stages.init.rehearsal:features")
     methods = {  # noqa: RUF012
         "auto": "known where init.cameras is given; a model where init.pointmap.checkpoint is "
         "given and one is installed; else colmap, and dental if that fails and teeth are found",

@@ -53,7 +53,7 @@ def supporting_views(
         each(
             _count_chunk, -(-len(places) // _CHUNK), places,
             np.ascontiguousarray(camera.cam_from_world, np.float64),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64),
             np.ascontiguousarray(surface.depth, np.float32), float(tolerance), count,
         )  # fmt: skip
     return count

@@ -372,7 +372,7 @@ def _fill(
     smooth = complete(inverse, weight, gray, far, options.fill_reach_px)
     result = depth.copy()
     open_pixels = ~known
-    weights = np.broadcast_to(np.float32(1), stack.shape)
+    weights = np.ones_like(stack)  # a view of one number would be a kernel of its own
     for retreat in _RETREATS:
         trial = 1 / ((1 - retreat) * smooth + retreat * np.float32(far))
         stack[index] = 0

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from pipeline.errors import RequestError
+
 Array = npt.NDArray[np.float64]
 
 #: Depth maps are trusted where at least this much of the light is accounted for ...
@@ -133,6 +135,12 @@ def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
     import pymeshlab
 
     work = pymeshlab.MeshSet(verbose=False)
+    if not hasattr(work, "meshing_close_holes"):
+        raise RequestError(
+            "PyMeshLab is installed but could not load its filters: a library of the system is "
+            "missing, mostly libOpenGL.so.0 (Debian, Ubuntu: libopengl0). 'pipeline doctor' says "
+            "which. Run the same command again then, or without a mesh: --set export.mesh=false."
+        )
     work.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces))
     work.meshing_remove_duplicate_vertices()
     work.meshing_remove_duplicate_faces()
