@@ -9,7 +9,7 @@ FROM python:3.11-slim-bookworm
 
 # what the wheels expect of the system (tools/system-packages)
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends libusb-1.0-0 libgl1 libopengl0 libx11-6 libgomp1 \
+    && apt-get install -y --no-install-recommends libusb-1.0-0 libgl1 libopengl0 libegl1 libx11-6 libgomp1 \
     && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /src

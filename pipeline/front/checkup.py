@@ -45,6 +45,7 @@ SYSTEM_LIBRARIES = {
     "usb-1.0": "libusb-1.0-0",
     "GL": "libgl1",
     "OpenGL": "libopengl0",
+    "EGL": "libegl1",
     "X11": "libx11-6",
     "gomp": "libgomp1",
 }
