@@ -142,7 +142,7 @@ def batch_command(
         typer.Option(
             "--keep",
             metavar="[workspace|results]",
-            help="What stays of a case that went well: all, or its results (at most 8 MB).",
+            help="What stays of a case that went well: all, or its results (at most 8 to 12 MB).",
         ),
     ] = "workspace",
     memory: Annotated[

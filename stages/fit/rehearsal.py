@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from pipeline.artifacts.cameras import Camera
@@ -35,7 +37,10 @@ def whole_fits() -> None:
     colour(colour.target, 0.2)
     planes, seen = np.ones((2, HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
     flow_loss(planes, seen, planes, seen, 1.0, planes.copy(), seen.copy())
-    for held, light in ((True, "camera"), (True, "none"), (False, "none")):
+    fits: tuple[tuple[bool, Literal["camera", "none"]], ...] = (
+        (True, "camera"), (True, "none"), (False, "none"),
+    )  # fmt: skip
+    for held, light in fits:
         names = [f"{k:03}" for k in range(3)]
         cameras = [_camera(k) for k in range(3)]
         config = FitConfig(

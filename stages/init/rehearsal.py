@@ -29,8 +29,12 @@ def teeth() -> None:
     image = np.ones((HEIGHT, WIDTH, 3), np.float32)
     camera = np.array([*np.eye(3).ravel(), 0.0, 0.0, 50.0, WIDTH, WIDTH / 2, HEIGHT / 2])
     photos = [
-        Photo(k, camera, (HEIGHT, WIDTH), 1.0, image, *[plain] * 7, used) for k in range(VIEWS)
-    ]
+        Photo(
+            k, camera, (HEIGHT, WIDTH), 1.0, image, plain, plain, plain, plain, plain, plain,
+            plain, used,
+        )
+        for k in range(VIEWS)
+    ]  # fmt: skip
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     points = np.stack([columns - WIDTH / 2, rows - HEIGHT / 2, 0 * rows], -1)
     normals = np.broadcast_to(np.array([0, 0, -1], np.float32), points.shape)

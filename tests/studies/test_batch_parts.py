@@ -13,6 +13,7 @@ import pytest
 
 from pipeline.errors import RequestError
 from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
+from pipeline.studies.batch.keep import keep_results
 from pipeline.studies.batch.listing import read_cases
 from pipeline.studies.batch.records import Case, new_record
 from pipeline.studies.batch.summary import csv_text, write_summary
@@ -148,3 +149,18 @@ def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:
     assert len(rows) == 950
     assert rows[0]["reason"] == f"'=cmd {bad} second line"
     assert (rows[1]["name"], rows[1]["psnr"]) == ("'=1+1", "31.25")
+
+
+def test_what_a_case_is_kept_for_may_take_more_room_than_the_rest(tmp_path: Path) -> None:
+    """A large viewer page stays with its mesh and report; what else there is has no room then."""
+    results = tmp_path / "results"
+    (tmp_path / "export").mkdir()
+    results.symlink_to("export")  # as a run leaves it
+    sizes = {"viewer.html": 8_500_000, "mesh.ply": 1_000_000, "mesh.glb": 500_000, "scene.json": 10}
+    for name, size in sizes.items():
+        (results / name).write_bytes(bytes(size))
+    (tmp_path / "report.html").write_bytes(bytes(1_000_000))
+    (tmp_path / "check.html").write_bytes(bytes(100_000))
+    assert sorted(keep_results(tmp_path)) == ["check.html", "mesh.glb"]
+    assert {path.name for path in results.iterdir()} == {"viewer.html", "mesh.ply", "scene.json"}
+    assert (tmp_path / "report.html").is_file() and not (tmp_path / "check.html").exists()

@@ -12,13 +12,18 @@ from pipeline.stage import stage_names
 from pipeline.store.places import is_folder, is_there, remove, size_of
 from pipeline.workspace import REQUEST
 
-#: Bytes that a case may have with ``--keep results``.
-MOST_KEPT = 8_000_000
-#: What is kept first, by the end of the name; what then has no room is left out, and said. The full
-#: splats (14 MB), COLMAP's model and the points are for further computing: they come last.
+#: Bytes that a case may have with ``--keep results``; and what the files may have together that a
+#: case is kept for: photographs of 1024 pixels make a viewer page of 8 to 10 MB.
+MOST_KEPT, MOST_WANTED = 8_000_000, 12_000_000
+#: Those files, by the end of the name, most wanted first.
+WANTED = (
+    ".txt", ".json", ".csv", "viewer.html", "mesh.ply", "mesh_without_scale.ply", REPORT,
+)  # fmt: skip
+#: What is kept next; what then has no room is left out, and said. The full splats (14 MB), COLMAP's
+#: model and the points are for further computing: they come last.
 ORDER = (
-    ".txt", ".json", ".csv", REPORT, ".html", ".spz", ".sog", "mesh.ply", "mesh.glb",
-    "mesh_without_scale.glb", ".mp4", CHECK, ".glb", ".stl", ".png", "points.ply", ".ply",
+    *WANTED, "mesh.glb", "mesh_without_scale.glb", ".spz", ".sog", ".mp4", CHECK, ".glb", ".stl",
+    ".png", "points.ply", ".ply",
 )  # fmt: skip
 #: Long side of the summary's pictures, pixels.
 THUMBNAIL = 160
@@ -29,7 +34,7 @@ _MAKING, _MADE = ".results.part", ".results"
 
 
 def keep_results(workspace: Path) -> list[str]:
-    """Keep the results of a case within `MOST_KEPT` and the pages about it; the rest is deleted.
+    """Keep the results of a case and the pages about it, within limits; the rest is deleted.
 
     A kill at any moment loses nothing: call it again.
 
@@ -68,14 +73,15 @@ def _copy_within(results: Path, workspace: Path, into: Path) -> list[str]:
     """Copy results, most wanted first, as far as there is room; returns what was left out."""
     entries = list(results.iterdir())
     pages = [workspace / page for page in (REPORT, CHECK) if (workspace / page).is_file()]
-    room = MOST_KEPT
+    taken = 0
     left_out = []
     for entry in sorted([*entries, *pages], key=_rank):
         size = size_of(entry)
-        if entry.is_dir() or size > room:
+        most = MOST_WANTED if _rank(entry)[0] < len(WANTED) else MOST_KEPT
+        if entry.is_dir() or taken + size > most:
             left_out.append(entry.name)
             continue
-        room -= size
+        taken += size
         if entry.parent == results:
             _copy(entry, into / entry.name)
     return left_out

@@ -61,7 +61,7 @@ def batch(
         scheduler: address or file of a Dask scheduler, to run on its workers instead.
         preset, overrides, stages: as `pipeline.run` has them, for all cases.
         retry: ``failed``, or names of cases: run these again though they came to an end.
-        keep: ``results``: of a case that went well only these are kept, at most 8 MB.
+        keep: ``results``: of a case that went well only these are kept, at most 8 to 12 MB.
         memory: gigabytes that the processes of one case may take; None: an equal share of the
             machine, or what a worker was given; 0: as much as there is.
         minutes: that one case may take; None: as many as it needs.
