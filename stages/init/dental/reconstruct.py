@@ -120,7 +120,8 @@ def reconstruct_teeth(
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
             "Check the numbers in the labelled photographs; a wrong one can be put right on the "
-            f"page check.html. {HOW_TO_SHOOT_TEETH}",
+            f"page check.html. {HOW_TO_SHOOT_TEETH} If you know better, go on all the same: "
+            "--set init.dental.accept_doubtful=true.",
             pictures,
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )

@@ -128,18 +128,15 @@ def fit_doubts(
             f"{figures['margin']:.0f}, wanted {options.min_margin:.0f}): check the numbers"
         )
     known = scorer.held is not None
-    worst: list[tuple[float, str]] = []
-    for view, photo in enumerate(photos):
+    worst: list[tuple[float, int]] = []
+    for view in range(len(photos)):
         common, colour = evidence.common_mouth[view], evidence.colours[view]
         figures[f"common_mouth_{view}"], figures[f"colour_{view}"] = common, colour
-        worst.append((same_mouth(common, colour, options), photo))
-    figures["same_mouth"] = min(sure for sure, _ in worst)
+        worst.append((same_mouth(common, colour, options), view))
+    figures["same_mouth"], odd = min(worst)
     # One photograph of another patient makes all three strangers to each other: the worst is named.
     if figures["same_mouth"] < 0 and not known:
-        doubts.append(
-            f"{min(worst)[1]} may show another patient, or a mirrored picture: its colours and the "
-            "places of its teeth fit the others' badly"
-        )
+        doubts.append(_stranger(photos[odd], places_fit=evidence.common_mouth[odd] > 0))
     for view, factor in evidence.mirrored.items():
         figures[f"mirrored_{view}"] = factor
         if factor > PERHAPS_MIRRORED:
@@ -166,6 +163,20 @@ def fit_doubts(
                 f"{100 * pair.epipolar_error:.1f} % of the height of the row, median)"
             )
     return doubts, figures
+
+
+def _stranger(photo: str, places_fit: bool) -> str:
+    """Why a photograph may show another mouth than the others."""
+    if places_fit:
+        return (
+            f"{photo} may show another patient, or was taken in another light (a phone chooses its "
+            "own white balance): its teeth stand where the others' do, but its colours differ more "
+            "than those of one patient in one light"
+        )
+    return (
+        f"{photo} may show another patient, or a mirrored picture: its colours and the places of "
+        "its teeth fit the others' badly"
+    )
 
 
 def _view_doubts(
