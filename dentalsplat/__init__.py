@@ -235,7 +235,7 @@ def batch(
         scheduler: address or file of a Dask scheduler, to run on its workers instead.
         preset, overrides, stages: as for `run`, for all cases.
         retry: ``failed``, or names of cases: run these again though they came to an end.
-        keep: ``results``: of a case that went well only these are kept, at most 8 MB.
+        keep: ``results``: of a case that went well only these are kept, at most 8 to 12 MB.
         memory: gigabytes that one case may take; None: an equal share; 0: no limit.
         minutes: that one case may take; None: as many as it needs.
         share: who else may read the folder; see `run`.

@@ -249,7 +249,7 @@ def library_version(name: str) -> str:
 
 
 def stage_inputs(stage: Stage, table: Mapping[str, Input]) -> dict[str, Input]:
-    """The part of the provider table that a stage takes."""
+    """The part that a stage takes of what `Providers.of` offers."""
     return {k: table[k] for k in (*stage.requires, *stage.optional) if k in table}
 
 

@@ -177,7 +177,6 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 
 def _from_features(context: StageContext, views: Views) -> None:
-    from stages.init.dental.place import from_teeth
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
@@ -206,6 +205,8 @@ def _from_features(context: StageContext, views: Views) -> None:
         return
     placed = {camera.name for camera in placement.cameras}
     if config.method == "auto" and _teeth_know_more(_teeth_to_try(context, views), placed):
+        from stages.init.dental.place import from_teeth
+
         context.progress("features link few of the photographs; trying the teeth", 0, 1)
         try:
             from_teeth(context, views)
