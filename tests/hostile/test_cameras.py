@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext
 from stages.swap.stage import SwapConfig, SwapStage
 
+#: Files that claim to be endless are refused, not read to their end.
+pytestmark = pytest.mark.timeout(60)
 SETTING = "init.cameras"
 Change = Callable[[dict[str, Any]], Any]
 NAN, INF = float("nan"), float("inf")
@@ -32,10 +33,8 @@ def cameras() -> dict[str, Any]:
 
 def refused(path: Path, text: str) -> str:
     path.write_text(text)
-    begin = time.monotonic()
     with pytest.raises(RequestError) as error:
         read_cameras(model_files(path, SETTING).values(), SETTING)
-    assert time.monotonic() - begin < 2
     said = str(error.value)
     assert said.startswith(f"{SETTING}: {path} ") and error.value.exit_status == 2
     assert len(said) < 500

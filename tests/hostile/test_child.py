@@ -25,6 +25,7 @@ import sys, signal
 from pipeline.untrusted.child import Child
 def stop(*_): raise KeyboardInterrupt
 signal.signal(signal.SIGTERM, stop)
+signal.signal(signal.SIGINT, stop)  # a shell ignores it for what it starts with &
 with Child("child_work:work", 1 << 28) as child:
     for reply, _ in child.ask({"do": "hang"}):
         print(reply["pid"], flush=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,8 @@ from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.geometry.models.model_points import read_model_points
 from pipeline.studies.compare.evidence import mapped_keypoints, read_evidence
 
+#: Counts that no file could hold are refused, not waited for.
+pytestmark = pytest.mark.timeout(60)
 SETTING = "init.cameras"
 STEMS = ("cameras", "images", "points3D", "rigs", "frames")
 
@@ -40,11 +41,9 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refused(folder: Path) -> str:
-    """What is said of a model, in a moment."""
-    begin = time.monotonic()
+    """What is said of a model."""
     with pytest.raises(RequestError) as error:
         read_cameras(model_files(folder, SETTING).values(), SETTING)
-    assert time.monotonic() - begin < 5
     said = str(error.value)
     assert said.startswith(f"{SETTING}: {folder} ")
     assert "Is it whole?" in said or "holds no posed image" in said
@@ -297,10 +296,8 @@ def test_a_database_that_never_ends_is_given_up(tmp_path: Path) -> None:
         tmp_path / "database.db", "PRAGMA foreign_keys = OFF", "DROP TABLE images",
         f"CREATE VIEW images AS {endless}",
     )  # fmt: skip
-    begin = time.monotonic()
     with pytest.raises(sqlite3.Error, match="images"):
         read_evidence(path)
-    assert time.monotonic() - begin < 2
 
 
 @pytest.mark.parametrize("content", [b"", b"no database", b"SQLite format 3\0" + bytes(400)])
