@@ -15,7 +15,7 @@ from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext
 from stages.swap.stage import SwapConfig, SwapStage
 
-#: Files that claim to be endless are refused, not read to their end.
+#: What is refused is not waited for.
 pytestmark = pytest.mark.timeout(60)
 SETTING = "init.cameras"
 Change = Callable[[dict[str, Any]], Any]
