@@ -31,6 +31,7 @@ from stages.teeth.read import Reading
 
 if TYPE_CHECKING:
     from stages.init.dental.solution import ArchFit
+    from stages.views.load import Loaded
 
 Picture = npt.NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parent.parent
@@ -73,6 +74,14 @@ class Outcome:
     warnings: tuple[str, ...] = ()
 
 
+def prepared(loaded: Loaded, mirrored: bool) -> View:
+    """The view of a photograph, or of its mirror image."""
+    from stages.views.load import prepared_views
+
+    view = prepared_views([loaded])[0]
+    return view.mirrored() if mirrored else view
+
+
 class Runner:
     """Runs items; readings of photographs are kept in a folder.
 
@@ -89,7 +98,7 @@ class Runner:
         self._code = _digest_of_reader()
         self._reading_seconds = 0.0
         self._fits: list[ArchFit] = []
-        self._photos: dict[tuple[Path, bool], View] = {}
+        self._photos: dict[tuple[Path, int], Loaded] = {}
 
     def views_of(self, item: Item) -> tuple[Views, float]:
         """The views of an item, and the seconds that the stage took.
@@ -101,26 +110,25 @@ class Runner:
             with tempfile.TemporaryDirectory() as scratch:
                 context, seconds = self._run("views", Path(scratch), {}, {}, sources)
                 return context.result("views"), seconds
+        from stages.views.sharpness import SIZES, best_size
+
+        largest = [self._photo(photo, SIZES[0]) for photo in item.photos]
+        size = best_size([loaded.picture for loaded in largest])
         views = []
         for number, photo in enumerate(item.photos):
-            view = self._photo(photo)
+            view = prepared(self._photo(photo, size), photo.mirrored)
             views.append(replace(view, name=f"{number:03d}", source_name=f"{photo.shown}.jpg"))
         return Views(tuple(views)), 0.0
 
-    def _photo(self, photo: Photo) -> View:
-        key = photo.path, photo.mirrored
+    def _photo(self, photo: Photo, long_side: int) -> Loaded:
+        key = photo.path, long_side
         if key not in self._photos:
-            from stages.views.load import load_photos, prepared_views
+            from stages.views.load import load_photos
 
-            settings = get_stage("views").Config().model_dump()
-            loaded = load_photos(
-                {photo.path.name: photo.path}, {}, threads=1, progress=lambda *_: None,
-                long_side=settings["long_side"], min_side=settings["min_side"],
-            )  # fmt: skip
-            view = prepared_views(loaded)[0]
-            if photo.mirrored:
-                view = view.mirrored()
-            self._photos[key] = view
+            self._photos[key] = load_photos(
+                {photo.path.name: photo.path}, {}, long_side,
+                get_stage("views").Config().model_dump()["min_side"],
+            )[0]  # fmt: skip
         return self._photos[key]
 
     def run(self, item: Item) -> Outcome:
@@ -128,6 +136,8 @@ class Runner:
         try:
             views, seconds = self.views_of(item)
         except PipelineError as error:
+            if item.sort not in (CASE, SERIES):
+                raise  # its photographs are the cases': what can't be read there is no verdict
             return Outcome(False, str(error), Views(()))
         outcome = Outcome(False, "", views, seconds={"views": seconds})
         with tempfile.TemporaryDirectory() as scratch, self._taps():
