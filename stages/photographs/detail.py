@@ -21,8 +21,10 @@ DEGREE = 4
 #: which nothing is shown. 84 real photographs of teeth and houses leave 11 levels and .090 of the
 #: mean or more, at 512 pixels with a blur of 12 pixels 8.0 and .064, of 20 pixels 5.9 and .046. The
 #: share lets dark ones pass (a quarter of the light: 2.8 levels, .090), the levels pale ones (half
-#: of the contrast, blur of 6 pixels: 5.0 levels, .031). Painted walls in uneven light, with dark
-#: corners and noise up to 10 levels, leave .3 to 4 levels.
+#: of the contrast, blur of 6 pixels: 5.0 levels, .031).
+#: Of made walls (light from a side, dark corners or a lamp's spot; noise of up to 10 levels, in
+#: grains of 1.5 pixels 5, of 3 pixels 2) 394 of 405 of 60 to 200 levels are below both, 76 of 135
+#: of 20 levels, 108 of 135 of 245, which light from a side overexposes.
 LEAST_LEVELS, LEAST_SHARE = 4.0, 0.045
 #: and below which nothing is shown in any case: the noise of darkness has no mean to be a share of
 DARKNESS = 0.5
