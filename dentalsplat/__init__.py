@@ -188,6 +188,7 @@ def benchmark(
     overrides: Settings = (),
     share: Share | None = None,
     say: Callable[[str], None] | None = None,
+    verbose: bool = False,
 ) -> dict[str, Any]:
     """Run scenes x methods x view counts, and write tables of them.
 
@@ -198,7 +199,8 @@ def benchmark(
         jobs: workspaces at a time; the cores are divided between them.
         overrides: settings for all cells.
         share: who else may read the folder; see `run`.
-        say: hears a line per cell.
+        say: hears a line per cell. None: nothing is said, of what goes on in the cells neither.
+        verbose: the cells' processes say each step, keys and memory on standard error.
 
     Returns:
         What ``results.json`` holds.
@@ -207,8 +209,9 @@ def benchmark(
         RequestError: the suite is wrong, its data are missing, or `out` can't be used.
     """
     return _engine().benchmark(
-        suite, out=out, data=data, jobs=jobs, overrides=overrides, share=share, say=say
-    )
+        suite, out=out, data=data, jobs=jobs, overrides=overrides, share=share, say=say,
+        verbose=verbose,
+    )  # fmt: skip
 
 
 def batch(

@@ -21,8 +21,10 @@ from pipeline.front.options import (
     Quiet,
     Sharing,
     Stages,
+    Verbose,
     Verify,
     Workspace,
+    answer,
     names,
     only_workspace,
     sharing,
@@ -108,9 +110,7 @@ def run_command(
     ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
-    verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Say more: each step, keys, memory.")
-    ] = False,
+    verbose: Verbose = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the whole trace of an error.")
     ] = False,
@@ -137,12 +137,10 @@ def run_command(
         profile=profile,
         reporter=make_reporter(quiet=quiet or dry_run, verbose=verbose),
     )
-    if as_json:
-        print(json.dumps(summary.to_dict(), indent=1))
-    elif dry_run:
-        print_dry_run(summary)
-    elif not quiet:
-        print_summary(summary)
+    show = print_dry_run if dry_run else print_summary
+    answer(
+        summary.to_dict, lambda: show(summary), as_json=as_json, quiet=quiet and not dry_run
+    )  # fmt: skip
 
 
 @app.command("status")
@@ -272,12 +270,19 @@ def register_command(
         Path | None,
         typer.Option("-o", "--out", help="Folder of the results.  [default: B/register]"),
     ] = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Two visits of one patient in one frame: which teeth moved, how far and which way."""
+    from pipeline.front.progress import make_reporter
     from pipeline.studies.register import run_register
 
-    page, said = run_register(first, second, out)
-    print(f"{said}\n\nLook at it: open {page} in a browser.")
+    page, said = run_register(
+        first, second, out, reporter=make_reporter(quiet=quiet, verbose=verbose)
+    )
+    if not quiet:
+        size = page.stat().st_size / 1e6
+        print(f"{said}\n\nLook at it: open {page} ({size:.1f} MB) in a browser.")
 
 
 @app.command("clean")

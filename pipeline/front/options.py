@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -61,7 +62,25 @@ Sharing = Annotated[
     ),
 ]  # fmt: skip
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but errors.")]
+Verbose = Annotated[
+    bool, typer.Option("-v", "--verbose", help="Say more: each step, keys, memory.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def answer(
+    result: Callable[[], Any], show: Callable[[], None], *, as_json: bool, quiet: bool
+) -> None:
+    """Print what came of a command: as JSON where that is asked for, else in words, unless quiet.
+
+    Args:
+        result: gives it as JSON values.
+        show: prints it in words.
+    """
+    if as_json:
+        print(json.dumps(result(), indent=1))
+    elif not quiet:
+        show()
 
 
 def names(stages: str | None) -> list[str] | None:

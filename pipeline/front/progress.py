@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, TextIO
+from collections.abc import Callable
+from typing import Any, TextIO, TypeVar
 
 from pipeline.running.outcomes import StageOutcome
 from pipeline.running.reporter import Figure, Reporter
+
+Said = TypeVar("Said")
 
 
 def describe(figures: dict[str, Any]) -> str:
@@ -188,10 +191,28 @@ class LiveReporter(Reporter):
         self._display.stop()
 
 
+def fitting(
+    silent: Callable[[], Said], lines: Callable[[bool], Said], live: Callable[[], Said], *,
+    quiet: bool, verbose: bool,
+) -> Said:  # fmt: skip
+    """What says as much as -q and -v ask for (of both -q counts), as suits standard error.
+
+    Args:
+        silent: makes what says nothing.
+        lines: makes what writes lines that stay; told whether they are to say more.
+        live: makes what a terminal shows.
+    """
+    if quiet:
+        return silent()
+    return live() if sys.stderr.isatty() and not verbose else lines(verbose)
+
+
 def make_reporter(quiet: bool = False, verbose: bool = False) -> Reporter:
     """The reporter that suits standard error; where it is to be verbose, lines that stay."""
-    if quiet:
-        return Reporter()
-    if verbose:
-        return LineReporter(interval=0.5, verbose=True)
-    return LiveReporter() if sys.stderr.isatty() else LineReporter()
+    return fitting(
+        Reporter,
+        lambda more: LineReporter(interval=0.5 if more else 5.0, verbose=more),
+        LiveReporter,
+        quiet=quiet,
+        verbose=verbose,
+    )

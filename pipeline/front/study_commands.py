@@ -13,9 +13,12 @@ from pipeline.front.options import (
     AsJson,
     Overrides,
     Preset,
+    Quiet,
     Sharing,
     Stages,
+    Verbose,
     Workspace,
+    answer,
     names,
     one_of,
     only_workspace,
@@ -44,6 +47,8 @@ def compare_command(
     ] = True,
     threads: Annotated[int, typer.Option("--threads", min=0, help="0: all cores.")] = 0,
     as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Set the cameras, points and fit of a run beside COLMAP's on the same views.
 
@@ -58,13 +63,15 @@ def compare_command(
 
     found = compare(
         workspace or only_workspace(), colmap=colmap, run_colmap=run_colmap,
-        ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads, reporter=make_reporter(),
+        ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads,
+        reporter=make_reporter(quiet=quiet, verbose=verbose),
     )  # fmt: skip
-    if as_json:
-        print(json.dumps(found.figures, indent=1))
-    else:
+
+    def show() -> None:
         print_tables(tables_of(found.figures))
         print(f"\nResults: {found.folder}/")
+
+    answer(lambda: found.figures, show, as_json=as_json, quiet=quiet)
 
 
 def benchmark_command(
@@ -85,6 +92,8 @@ def benchmark_command(
     overrides: Overrides = None,
     share: Sharing = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Compare methods on scenes and numbers of views, and write the paper's tables of them.
 
@@ -92,14 +101,17 @@ def benchmark_command(
     pipeline benchmark configs/suites/paper.yaml --data ../data --jobs 2. Finished cells are not run
     again. Results: tables.md, tables.csv, results.json and report.html.
     """
+    from pipeline.front.progress import LineReporter
     from pipeline.studies.benchmark.running import benchmark
     from pipeline.studies.benchmark.writing import markdown
 
     results = benchmark(
         suite, out=out, data=data, jobs=jobs, overrides=overrides or [],
-        share=sharing(share), say=lambda text: print(text, file=sys.stderr, flush=True),
+        share=sharing(share), say=None if quiet else LineReporter().message, verbose=verbose,
     )  # fmt: skip
-    print(json.dumps(results, indent=1) if as_json else markdown(results), end="\n" * as_json)
+    answer(
+        lambda: results, lambda: print(markdown(results), end=""), as_json=as_json, quiet=quiet
+    )  # fmt: skip
     if results["problems"]:
         print("\n" + "\n".join(results["problems"]), file=sys.stderr)
         faults = any(cell["status"] == "fault" for cell in results["cells"])
@@ -158,6 +170,8 @@ def batch_command(
     ] = None,
     share: Sharing = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run many cases, each in a process of its own, and keep a table of what came of them.
 
@@ -172,12 +186,11 @@ def batch_command(
     results = batch(
         cases, out=out, jobs=jobs, scheduler=scheduler, preset=config, overrides=overrides or [],
         stages=names(stages), retry=retry or [], keep=one_of("--keep", keep, KEEPS),
-        memory=memory, minutes=minutes, share=sharing(share), progress=make_progress(),
+        memory=memory, minutes=minutes, share=sharing(share),
+        progress=make_progress(quiet=quiet, verbose=verbose),
     )  # fmt: skip
-    if as_json:
-        print(json.dumps(results, indent=1))
-    else:
-        print(f"{by_state(results['counts'])}\nSummary: {results['folder']}/summary.html")
+    told = f"{by_state(results['counts'])}\nSummary: {results['folder']}/summary.html"
+    answer(lambda: results, lambda: print(told), as_json=as_json, quiet=quiet)
     if status := exit_status(results):
         raise typer.Exit(status)
 

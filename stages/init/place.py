@@ -24,6 +24,7 @@ from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions, Refinement
 from stages.init.sfm.reconstruct import Attempt, find_features, match_views, reconstruct
 from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
 from stages.init.sfm.undistort import undistort_image
+from stages.photographs.detail import shows_nothing
 from stages.photographs.sharpness import UNSHARP, weakest_direction
 
 Progress = Callable[[str, int, int], None]
@@ -68,24 +69,29 @@ def place_classical(
     )  # fmt: skip
     names = [photo_name(view) for view in views]
     limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)
-    unsharp = _unsharp(views, attempt)
-    diagnosis = failure(attempt, names, limits, unsharp)
+    unsharp, blank = _unsharp_and_blank(views, attempt)
+    diagnosis = failure(attempt, names, limits, unsharp, blank)
     if diagnosis:
         # All pairs that have any geometry: what is missing shows in the weak ones.
         links = replace(links_of(views, attempt), used=frozenset())
         drawn = match_pictures(links, pictures)
         raise ReconstructionError(diagnosis, drawn)
-    for text in warnings_of(attempt, names, unsharp):
+    for text in warnings_of(attempt, names, unsharp, blank):
         warn(text)
     return _from_attempt(views, attempt)
 
 
-def _unsharp(views: list[View], attempt: Attempt) -> list[int]:
-    """The photographs that are shaken or out of focus, where some could not be placed."""
+def _unsharp_and_blank(views: list[View], attempt: Attempt) -> tuple[list[int], list[int]]:
+    """Photographs that are shaken or out of focus, and those of an even surface and nothing else.
+
+    Asked only where some could not be placed.
+    """
     if attempt.solution is not None and len(attempt.solution.poses) == len(views):
-        return []
+        return [], []
     greys = [view.gray().astype(np.float32) for view in views]
-    return [k for k, grey in enumerate(greys) if weakest_direction(grey) < UNSHARP]
+    blank = [k for k, grey in enumerate(greys) if shows_nothing(grey)]
+    soft = [k for k, grey in enumerate(greys) if weakest_direction(grey) < UNSHARP]
+    return [k for k in soft if k not in blank], blank
 
 
 def links_of(views: list[View], attempt: Attempt) -> Links:

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import pytest
+import typer
 from rich.console import Console
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from pipeline.front import progress
+from pipeline.front.options import answer
 from pipeline.front.progress import LineReporter, LiveReporter, Pace, describe
 
 
@@ -63,3 +71,68 @@ def test_live_display_shows_stage_step_and_loss(monkeypatch) -> None:  # type: i
     for text in ("fit", "optimise", "loss 0.25", "33 %", "careful [now]", "gaussians 7"):
         assert text in shown
     assert type(progress.make_reporter(quiet=True)) is progress.Reporter, "which says nothing"
+
+
+#: The commands that say how far they are.
+SPEAKING = ("run", "compare", "benchmark", "batch", "register")
+
+
+def test_quiet_and_verbose_are_the_same_everywhere() -> None:
+    """In the help, and so in what the shell completes."""
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    told = {}
+    for name, command in commands.items():
+        found = [p for p in command.params if {"-q", "-v"} & set(p.opts)]
+        told[name] = [(parameter.opts, parameter.help) for parameter in found]
+    assert {name for name, options in told.items() if options} == set(SPEAKING)
+    assert all(told[name] == told["run"] for name in SPEAKING)
+    assert [options for options, _ in told["run"]] == [["-q", "--quiet"], ["-v", "--verbose"]]
+
+
+def test_json_is_printed_however_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    def told(**how: bool) -> str:
+        answer(lambda: {"teeth": 3}, lambda: print("three teeth"), **how)
+        return capsys.readouterr().out
+
+    assert told(as_json=False, quiet=False) == "three teeth\n"
+    assert told(as_json=False, quiet=True) == ""
+    as_json = told(as_json=True, quiet=False)
+    assert as_json == told(as_json=True, quiet=True) == '{\n "teeth": 3\n}\n'
+
+
+@pytest.mark.parametrize(
+    ("terminal", "quiet", "verbose", "what"),
+    [
+        (True, False, False, "live"), (False, False, False, "lines"), (True, False, True, "more"),
+        (False, False, True, "more"), (True, True, False, "silent"), (False, True, True, "silent"),
+    ],
+)  # fmt: skip
+def test_what_fits(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool, quiet: bool, verbose: bool, what: str
+) -> None:
+    monkeypatch.setattr("sys.stderr", SimpleNamespace(isatty=lambda: terminal))
+    made = progress.fitting(
+        lambda: "silent", lambda more: "more" if more else "lines", lambda: "live",
+        quiet=quiet, verbose=verbose,
+    )  # fmt: skip
+    assert made == what
+
+
+def test_compare_speaks_as_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What it computes is another test's; here, who hears of it, and what is printed."""
+    heard = []
+
+    def found(*_: Any, reporter: Any, **__: Any) -> SimpleNamespace:
+        heard.append(reporter)
+        reporter.message("COLMAP runs")
+        return SimpleNamespace(figures={"cameras": []}, folder=tmp_path)
+
+    monkeypatch.setattr("pipeline.studies.compare.compare.compare", found)
+    monkeypatch.setattr("pipeline.studies.compare.tables.tables_of", lambda _: [])
+    shell, base = CliRunner(), ["compare", "-w", str(tmp_path)]
+    usual, quiet, more = (shell.invoke(app, [*base, *how]) for how in ([], ["-q"], ["-v"]))
+    assert "COLMAP runs" in usual.stderr and "Results: " in usual.stdout
+    assert quiet.exit_code == 0 and quiet.output == ""
+    assert "COLMAP runs" in more.stderr and heard[2]._verbose and not heard[0]._verbose
+    as_json = [shell.invoke(app, [*base, "--json", *how]).stdout for how in ([], ["-q"], ["-v"])]
+    assert as_json == ['{\n "cameras": []\n}\n'] * 3

@@ -99,3 +99,30 @@ def test_an_unsharp_photograph_that_is_left_out_is_called_so():
     assert "'left.jpg' is not sharp" in text
     assert "'right.jpg' is not sharp" not in text, "it was placed"
     assert "more than 35 degrees" not in text
+
+
+def test_photographs_of_nothing_are_called_so_and_nothing_else():
+    attempt = Attempt(None, evidence(keypoints=(3, 0, 900)), False, False)
+    text = failure(attempt, NAMES, Limits(3, 2.0), [], [0, 1])
+    assert text.startswith("'right.jpg', 'front.jpg' show nothing to match: an even surface")
+    for other in ("sharp", "blurred", "degrees", "spots"):
+        assert other not in text, "the third alone can't be placed, whatever it is"
+
+
+def test_a_photograph_of_nothing_among_others_does_not_hide_why_these_fail():
+    edges = {(0, 1): two_view(30, 0.3)}
+    found = evidence(keypoints=(900, 900, 3), edges=edges)
+    text = failure(Attempt(None, found, False, False), NAMES, Limits(2, 2.0), [1], [2])
+    assert text.startswith("'left.jpg' shows nothing to match")
+    assert "'front.jpg' is not sharp" in text
+    assert "'right.jpg' and 'front.jpg' share too little: 500 spots" in text
+    assert "blurred" not in text
+
+
+def test_a_photograph_of_nothing_that_is_left_out_is_called_so():
+    edges = {(0, 1): two_view(200), (1, 2): two_view(4, 0.3)}
+    found = evidence(keypoints=(900, 900, 3), edges=edges, linked=[(0, 1)])
+    (text,) = warnings_of(Attempt(solution([0, 1]), found, True, True), NAMES, [], [0, 2])
+    assert "left out: 'left.jpg'. 'left.jpg' shows nothing to match" in text
+    assert "'right.jpg'" not in text, "it was placed"
+    assert "blurred" not in text and "photograph between" not in text

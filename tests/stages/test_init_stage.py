@@ -71,7 +71,7 @@ def test_identical_photographs_show_no_depth(tmp_path):
 
 def test_blank_photographs_are_named(tmp_path):
     blank = np.full((192, 256, 3), 0.5, np.float32)
-    with pytest.raises(ReconstructionError, match=r"too little to recognise in 'photo1.jpg'"):
+    with pytest.raises(ReconstructionError, match=r"'photo1.jpg' shows nothing to match"):
         run(tmp_path, [texture(0), blank, texture(1)])
 
 

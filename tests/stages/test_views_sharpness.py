@@ -98,3 +98,9 @@ def test_out_of_focus_is_unsharp_in_all_directions_and_noise_does_not_hide_it() 
     assert weakest_direction(soft) < UNSHARP
     assert weakest_direction(noisy) < UNSHARP
     assert weakest_direction(np.full((90, 120), 128, np.float32)) == 0
+
+
+@pytest.mark.parametrize("blur", [6, 12, 20])
+def test_the_rounding_of_what_is_very_soft_is_no_detail(blur: float) -> None:
+    soft = np.rint(cv2.GaussianBlur(scene(3, 512, 384), (0, 0), blur))
+    assert weakest_direction(soft) < UNSHARP

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -225,6 +226,34 @@ def alive(process: int) -> bool:
         return "child" in Path(f"/proc/{process}/cmdline").read_text()
     except OSError:
         return False
+
+
+def test_quiet_it_says_nothing_and_verbose_each_step(tmp_path: Path) -> None:
+    add_case(tmp_path, "anna", 1, 2)
+    add_case(tmp_path, "berta", 1, 3)
+
+    def call(*how: str) -> tuple[str, str]:
+        process = command(tmp_path, *how)
+        said = process.communicate(timeout=120)
+        assert process.returncode == 0, said
+        return said
+
+    out, err = call("-v")
+    assert "2 done" in out and "Summary: " in out
+    for name in ("anna", "berta"):
+        for text in (
+            "views: would run, key ",
+            "fit: starts",
+            "export: done in",
+            "key .*, peak memory mb",
+        ):
+            assert re.search(rf"^  {name}: {text}", err, re.MULTILINE), (name, text, err)
+        assert len(re.findall(rf"\] {name}: done", err)) == 1
+        assert err.count(f"{name}: fit: starts") == 1, "each line once"
+    assert call("-q", "--retry", "anna") == ("", "")
+    usual, quiet = call("--json"), call("--json", "-q")
+    told = [json.loads(text) | {"seconds": 0} for text, _ in (usual, quiet)]
+    assert told[0] == told[1] and "2 of 2 cases are done" in usual[1] and quiet[1] == ""
 
 
 @pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])

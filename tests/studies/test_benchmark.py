@@ -121,6 +121,30 @@ def test_finished_cells_are_not_run_again(bench: Any, tmp_path: Path) -> None:
     assert lines == ["4 of 4 cells are finished already"]
 
 
+def test_quiet_it_says_nothing_and_verbose_each_step(tmp_path: Path) -> None:
+    make_case(tmp_path)
+    write_suite(tmp_path)
+
+    def call(out: str, *how: str) -> tuple[str, str]:
+        done = subprocess.run(
+            [*toy_bench.COMMAND, "benchmark", "suite.yaml", "-o", out, *how], cwd=tmp_path,
+            env={**os.environ, "TOY_LOG": str(tmp_path / "log.txt")}, capture_output=True,
+            text=True, check=False, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout, done.stderr
+
+    assert call("quiet", "-q") == ("", "")
+    out, err = call("usual")
+    assert "| good" in out and "fit done in" in err and "[4/4]" in err
+    assert "fit: starts" not in err and "key" not in err
+    out, err = call("verbose", "-v")
+    assert "| good" in out and err.count(": fit: starts") == 4
+    assert err.count(": fit: would run, key ") == 4 and "peak memory mb" in err
+    usual, quiet = call("usual", "--json"), call("usual", "--json", "-q")
+    assert usual[0] == quiet[0] and json.loads(quiet[0])["cells"] and quiet[1] == ""
+
+
 def test_a_changed_method_makes_exactly_its_cells_stale(bench: Any, tmp_path: Path) -> None:
     def better(suite: dict[str, Any]) -> None:
         suite["methods"][1]["overrides"] = {"fit.quality": 9}

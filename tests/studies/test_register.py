@@ -182,6 +182,10 @@ def test_the_command_writes_table_page_and_mesh(
     result = CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
     assert result.exit_code == 0, result.output
     assert "12: " in result.output
+    size = (out / "register.html").stat().st_size
+    assert f"register.html ({size / 1e6:.1f} MB)" in result.stdout
+    assert "register: starts" in result.stderr and "register: done in" in result.stderr
+    assert "peak memory" not in result.stderr
     said = json.loads((out / "register.json").read_text())
     assert {t["fdi"] for t in said["teeth"] if t["moved"]} == set(MOVED)
     with (out / "movements.csv").open() as stream:
@@ -194,6 +198,24 @@ def test_the_command_writes_table_page_and_mesh(
     assert page.count("data:image/jpeg") == 9
     assert "http" not in page.replace("http-equiv", "")
     assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
+
+
+@pytest.mark.parametrize("how", ["-q", "-v"])
+def test_the_command_says_nothing_or_each_step(
+    workspaces: tuple[Path, Path], tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch,
+    found: comparing.Comparison,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(comparing, "compare_visits", lambda first, second: found)
+    monkeypatch.setattr("pipeline.front.progress.time.monotonic", iter(range(10_000)).__next__)
+    out = str(tmp_path / "out")
+    result = CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", out, how])
+    assert result.exit_code == 0, result.output
+    if how == "-q":
+        assert result.output == ""
+    else:
+        for text in (f"read {workspaces[1]} 1/4", "compare the teeth 2/4", "peak memory mb"):
+            assert text in result.stderr, text
+    assert (Path(out) / "register.html").exists()
 
 
 def test_no_workspace_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
         write_case(out, record)
         start = time.perf_counter()
         if trouble is None:
-            record |= _outcome(job, case, workspace, reporter or LineReporter(interval=20.0))
+            record |= _outcome(job, case, workspace, reporter or _reporter(job))
         else:
             record |= {"state": "wrong", "reason": trouble}
         if record["state"] == "stopped":
@@ -101,6 +101,11 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
         if record["kept"]:
             write_case(out, record)
     return record
+
+
+def _reporter(job: dict[str, Any]) -> Reporter:
+    """What writes the log of a case."""
+    return LineReporter(interval=5.0 if job["verbose"] else 20.0, verbose=job["verbose"])
 
 
 def _contents(case: Case) -> tuple[list[str], str | None]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, TextIO
 
-from pipeline.front.progress import Pace
+from pipeline.front.progress import Pace, describe, fitting
 from pipeline.studies.batch.records import STATES
 
 
@@ -36,7 +36,17 @@ def by_state(counts: Mapping[str, int]) -> str:
 class Lines:
     """A line for each case that ends, and now and then how all stand."""
 
-    def __init__(self, stream: TextIO | None = None, interval: float = 60.0) -> None:
+    def __init__(
+        self, stream: TextIO | None = None, interval: float = 60.0, *, verbose: bool = False
+    ) -> None:
+        """
+        Args:
+            stream: where the lines go; default standard error.
+            interval: seconds between two lines on how all stand.
+            verbose: also say each step of the cases, keys, and memory.
+        """
+        #: Whether it wants to hear `step`.
+        self.verbose = verbose
         self._stream = stream or sys.stderr
         self._interval = interval
         self._last = time.monotonic()
@@ -48,6 +58,14 @@ class Lines:
     def case(self, record: Mapping[str, Any], done: int, total: int) -> None:
         """A case has ended."""
         self.message(f"[{done}/{total}] {record['name']}: {outcome(record)}")
+        if self.verbose:
+            known = [(name, record.get(name)) for name in ("key", "peak_memory_mb")]
+            told = {name: value for name, value in known if value is not None}
+            self.message(f"  {record['name']}: {describe(told)}")
+
+    def step(self, record: Mapping[str, Any], text: str) -> None:
+        """A case says this of its run."""
+        self.message(f"  {record['name']}: {text}")
 
     def state(self, counts: Counter[str], done: int, total: int) -> None:
         """How all cases stand."""
@@ -102,6 +120,19 @@ class Bar(Lines):
         self._display.stop()
 
 
-def make_progress() -> Lines:
-    """What suits standard error."""
-    return Bar() if sys.stderr.isatty() else Lines()
+class Silent(Lines):
+    """Says nothing."""
+
+    def message(self, text: str) -> None:
+        """Nobody listens."""
+
+
+def make_progress(quiet: bool = False, verbose: bool = False) -> Lines:
+    """What suits standard error; where it is to be verbose, lines that stay."""
+    return fitting(
+        Silent,
+        lambda more: Lines(interval=5.0 if more else 60.0, verbose=more),
+        Bar,
+        quiet=quiet,
+        verbose=verbose,
+    )

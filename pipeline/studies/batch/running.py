@@ -24,10 +24,11 @@ from pipeline.store.locks import lock_of
 from pipeline.store.places import stage_folder
 from pipeline.studies.batch.cluster import check_workers, connected, require_dask, slots
 from pipeline.studies.batch.plan import Plan, make_plan
-from pipeline.studies.batch.progress import Lines, by_state
+from pipeline.studies.batch.progress import Lines, Silent, by_state
 from pipeline.studies.batch.records import FOLDERS, Case, new_record, read_case, write_case
 from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import BATCH, run_case, stop
+from pipeline.untrusted.names import readable
 
 Keep = Literal["workspace", "results"]
 KEEPS: tuple[Keep, ...] = get_args(Keep)
@@ -82,7 +83,7 @@ def batch(
         texts = tuple(overrides)
     place = Path(cases)
     folder = Path(out) if out is not None else Path("runs") / f"batch_{place.resolve().stem}"
-    progress = progress or _Silent()
+    progress = progress or Silent()
     start = time.perf_counter()
     named = tuple(stages) if stages else None
     common: dict[str, Any] = {
@@ -90,6 +91,7 @@ def batch(
         "overrides": list(texts), "stages": list(named) if named else None, "keep": keep,
         "memory": _memory_each(memory, jobs, scheduler), "seconds": (minutes or 0) * 60,
         "threads": 0 if scheduler else max(1, usable_cores() // jobs),
+        "verbose": progress.verbose,
     }  # fmt: skip
     plan = make_plan(place, folder, common["preset"], texts, named, retry, keep)
     with kept_for(share_for(folder, share)), _only_one(folder.absolute()) as home:
@@ -129,6 +131,7 @@ class _Work:
         self._left = {case.id for case in plan.waiting}
         self._written = 0.0
         self._seen: dict[str, int] = {}
+        self._heard = {case.id: _size(self._log(case)) for case in plan.waiting}
         #: Cases that are given out, by the keys of their tasks; a task whose future nobody holds
         #: is cancelled.
         self._cases: dict[str, Case] = {}
@@ -172,6 +175,7 @@ class _Work:
                     future = ended.get(timeout=TICK)
                     case = self._cases.pop(future.key)
                     del self._futures[future.key]
+                    self._listen(case)
                     self._ended(case, future, total)
                     continue  # all that have ended come first
                 self._look()
@@ -249,6 +253,7 @@ class _Work:
         for case in self._plan.waiting:
             if case.id not in self._left:
                 continue
+            self._listen(case)
             with contextlib.suppress(OSError):
                 stamp = (self._home / "records" / f"{case.id}.json").stat().st_mtime_ns
                 if self._seen.get(case.id) == stamp:
@@ -257,6 +262,22 @@ class _Work:
                 record = read_case(self._home, case.id)
                 if record is not None and record["session"] == self._common["session"]:
                     self._records[case.id] = record
+
+    def _log(self, case: Case) -> Path:
+        return self._home / "logs" / f"{case.id}.txt"
+
+    def _listen(self, case: Case) -> None:
+        """Hand on the lines that a case has written since, where somebody wants to hear them."""
+        if not self._progress.verbose:
+            return
+        new = b""
+        with contextlib.suppress(OSError), self._log(case).open("rb") as log:
+            log.seek(self._heard[case.id])
+            new = log.read()
+        whole = new[: new.rfind(b"\n") + 1]  # a line that is being written comes next time
+        self._heard[case.id] += len(whole)
+        for line in whole.decode(errors="replace").splitlines():
+            self._progress.step(self._records[case.id], readable(line.strip()))
 
     def _summary(self) -> None:
         counts = Counter(record["state"] for record in self._records.values())
@@ -270,9 +291,8 @@ class _Work:
         self._written = time.monotonic()
 
 
-class _Silent(Lines):
-    def message(self, text: str) -> None:
-        """Nobody listens."""
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
 
 
 def _text(value: Any) -> str:

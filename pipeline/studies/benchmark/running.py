@@ -51,6 +51,7 @@ def benchmark(
     overrides: Iterable[str] | Mapping[str, Any] = (),
     share: Share | None = None,
     say: Say | None = None,
+    verbose: bool = False,
 ) -> dict[str, Any]:
     """Run scenes x methods x view counts x seeds and write the paper's tables of them.
 
@@ -66,7 +67,8 @@ def benchmark(
         jobs: workspaces at a time, a process each; the cores are divided between them.
         overrides: settings for all cells: ``{"fit.iterations": 9}`` or ``["fit.iterations=9"]``.
         share: who else may read the folder; None: as it is already.
-        say: hears a line per cell.
+        say: hears a line per cell. None: nothing is said, of what goes on in the cells neither.
+        verbose: the cells' processes say each step, keys and memory on standard error.
 
     Returns:
         What ``results.json`` holds (see `pipeline.studies.benchmark.results`); `problems` names the
@@ -82,7 +84,8 @@ def benchmark(
     threads = max(1, usable_cores() // jobs)
     places = {cell.workspace.partition("/")[0] for cell in cells}
     with kept_for(share_for(folder, share)), _only_one(folder.absolute(), places) as place:
-        records = _run_all(cells, place, jobs, threads, say or (lambda text: None))
+        told = {"threads": threads, "quiet": say is None, "verbose": verbose}
+        records = _run_all(cells, place, jobs, told, say or (lambda text: None))
         results = _results(loaded, cells, tables, records, machine(jobs, threads))
         write_json(place / "results.json", results)
         write_tables(results, place)
@@ -117,9 +120,13 @@ def _only_one(folder: Path, places: Iterable[str]) -> Iterator[Path]:
 
 
 def _run_all(
-    cells: list[Cell], out: Path, jobs: int, threads: int, say: Say
+    cells: list[Cell], out: Path, jobs: int, told: Mapping[str, Any], say: Say
 ) -> dict[str, dict[str, Any]]:
-    """Bring every cell to its record; cells of one workspace run one after the other."""
+    """Bring every cell to its record; cells of one workspace run one after the other.
+
+    Args:
+        told: what the job of every cell says (`pipeline.studies.benchmark.worker`).
+    """
     records = {}
     waiting: dict[str, list[Cell]] = {}
     for cell in cells:
@@ -136,7 +143,7 @@ def _run_all(
     def work(queue: list[Cell]) -> None:
         nonlocal done
         for cell in queue:
-            record = processes.run(cell, out, threads)
+            record = processes.run(cell, out, told)
             if record is None:
                 return
             with processes.lock:
@@ -162,7 +169,7 @@ class _Processes:
         self._running: set[subprocess.Popen[str]] = set()
         self._stopped = False
 
-    def run(self, cell: Cell, out: Path, threads: int) -> dict[str, Any] | None:
+    def run(self, cell: Cell, out: Path, told: Mapping[str, Any]) -> dict[str, Any] | None:
         """Run one cell in a process; None if the benchmark is being stopped."""
         path = record_path(cell, out)
         remove(path)
@@ -176,8 +183,7 @@ class _Processes:
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             job = {
-                "cell": cell.to_dict(), "out": str(out), "threads": threads,
-                "share": share_for(out),
+                "cell": cell.to_dict(), "out": str(out), "share": share_for(out), **told,
             }  # fmt: skip
             process.stdin.write(json.dumps(job) + "\n")
             process.stdin.flush()

@@ -17,6 +17,8 @@ from typing import Any
 
 from pipeline.front.progress import LineReporter
 from pipeline.process.privacy import kept_for, private_from_now_on
+from pipeline.running.outcomes import StageOutcome
+from pipeline.running.reporter import Reporter
 from pipeline.store import write_sealed
 from pipeline.studies.benchmark.cells import Cell, record_path, run_cell, unfinished_record
 
@@ -24,22 +26,31 @@ from pipeline.studies.benchmark.cells import Cell, record_path, run_cell, unfini
 class CellReporter(LineReporter):
     """A line now and then, beginning with the cell's description; the rest is in its record."""
 
-    def __init__(self, cell: Cell) -> None:
-        super().__init__(interval=20.0)
+    def __init__(self, cell: Cell, *, verbose: bool = False) -> None:
+        super().__init__(interval=5.0 if verbose else 20.0, verbose=verbose)
         self._cell = cell
 
+    def foreseen(self, stages: list[StageOutcome]) -> None:
+        if self._verbose:
+            super().foreseen(stages)
+
     def stage_started(self, stage: str, reasons: list[str], resumed: bool) -> None:
+        if self._verbose:
+            super().stage_started(stage, reasons, resumed)
         self._last = time.monotonic()
 
     def stage_finished(self, stage: str, cached: bool, figures: dict[str, Any]) -> None:
-        if not cached:
+        if self._verbose:
+            super().stage_finished(stage, cached, figures)
+        elif not cached:
             self._say(f"{stage} done in {figures['wall_seconds']:.1f} s")
 
     def message(self, text: str) -> None:
-        """Notes are kept in the record."""
+        if self._verbose:  # they are kept in the record, too
+            super().message(text)
 
     def _say(self, text: str) -> None:
-        super()._say(f"  {self._cell.describe()}: {text}")
+        super()._say(f"  {self._cell.describe()}: {text.strip()}")
 
 
 def main() -> None:
@@ -50,7 +61,7 @@ def main() -> None:
     private_from_now_on()
     try:
         with kept_for(job["share"]):
-            record = run_cell(cell, out, job["threads"], CellReporter(cell))
+            record = run_cell(cell, out, job["threads"], _reporter(cell, job))
     except Exception as error:  # outside of any stage; it must not leave a trace on the terminal
         where = traceback.extract_tb(error.__traceback__)[-1]
         record = unfinished_record(
@@ -60,6 +71,10 @@ def main() -> None:
         )
     with kept_for(job["share"]):
         write_sealed(record_path(cell, out), record)
+
+
+def _reporter(cell: Cell, job: dict[str, Any]) -> Reporter:
+    return Reporter() if job["quiet"] else CellReporter(cell, verbose=job["verbose"])
 
 
 def _end_with_parent() -> None:

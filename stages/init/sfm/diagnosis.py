@@ -67,18 +67,40 @@ def least_views(count: int, fraction: float) -> int:
 
 
 def failure(
-    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int] = ()
-) -> str | None:
+    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int] = (),
+    blank: Sequence[int] = (),
+) -> str | None:  # fmt: skip
     """The diagnosis of an attempt as one paragraph, or None if the reconstruction is good.
 
     Args:
         names: how the user knows the photographs.
         unsharp: those that are shaken or out of focus; that is said first.
+        blank: those that show an even surface and nothing else; that is said before.
     """
-    found = _failure(attempt, names, limits, unsharp)
-    if found is None or not unsharp:
-        return found
-    return f"{_too_soft([names[view] for view in unsharp])} {found}"
+    found = _failure(attempt, names, limits, unsharp, blank)
+    if found is None:
+        return None
+    said = _bad_ones(names, unsharp, blank)
+    if len(names) - len(blank) < limits.min_views:
+        return " ".join(said)  # the others could not do it, whatever they share
+    return " ".join([*said, found])
+
+
+def _bad_ones(names: list[str], unsharp: Sequence[int], blank: Sequence[int]) -> list[str]:
+    """A part of a diagnosis for each way in which photographs are bad by themselves."""
+    return [
+        text([names[view] for view in views])
+        for text, views in ((_nothing_shown, blank), (_too_soft, unsharp)) if views
+    ]  # fmt: skip
+
+
+def _nothing_shown(names: list[str]) -> str:
+    one = len(names) == 1
+    return (
+        f"{_listed(names)} {'shows' if one else 'show'} nothing to match: an even surface without "
+        "detail, as of a bare wall, a covered lens or far too much light. Leave "
+        f"{'it' if one else 'them'} out, or take {'it' if one else 'them'} again of the teeth."
+    )
 
 
 def _too_soft(names: list[str]) -> str:
@@ -91,18 +113,23 @@ def _too_soft(names: list[str]) -> str:
 
 
 def _failure(
-    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int]
-) -> str | None:
+    attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int],
+    blank: Sequence[int],
+) -> str | None:  # fmt: skip
     if len(names) < 2:
         return (
             f"One photograph ({', '.join(names)}) can't give a 3D scene: at least two are needed, "
             f"three or more are better. {HOW_TO_SHOOT}"
         )
+    bad = [*unsharp, *blank]
     evidence, solution = attempt.evidence, attempt.solution
-    blank = [names[view] for view, count in enumerate(evidence.keypoints) if count < 50]
-    if blank and (solution is None or len(solution.poses) < limits.min_views):
+    poor = [
+        names[view] for view, count in enumerate(evidence.keypoints)
+        if count < 50 and view not in blank
+    ]  # fmt: skip
+    if poor and (solution is None or len(solution.poses) < limits.min_views):
         return (
-            f"There is too little to recognise in {_listed(blank)} (fewer than 50 distinct "
+            f"There is too little to recognise in {_listed(poor)} (fewer than 50 distinct "
             "spots): the photograph is blurred, too dark, too bright, or its mask covers it. "
             "Leave it out or take it again."
         )
@@ -112,7 +139,7 @@ def _failure(
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
-            f"{_gaps(evidence, names, unsharp)} {_advice(attempt, names, unsharp)}"
+            f"{_gaps(evidence, names, bad)} {_advice(attempt, names, bad)}"
         ).rstrip()
     doubt = doubtful(solution, evidence, limits)
     if doubt:
@@ -120,14 +147,14 @@ def _failure(
     if len(solution.poses) < limits.min_views:
         unplaced = [view for view in range(len(names)) if view not in solution.poses]
         reasons = " ".join(
-            _why_unplaced(evidence, names, view, set(solution.poses), unsharp)
-            for view in unplaced[:MOST_NAMED]
+            _why_unplaced(evidence, names, view, set(solution.poses), bad)
+            for view in [view for view in unplaced if view not in blank][:MOST_NAMED]
         )
         return (
             f"Only {len(solution.poses)} of {len(names)} photographs could be placed; at least "
             f"{limits.min_views} are needed. Not placed: "
             f"{_listed([names[view] for view in unplaced])}. {reasons} "
-            f"{_advice(attempt, names, unsharp)}"
+            f"{_advice(attempt, names, bad)}"
         ).rstrip()
     return None
 
@@ -191,12 +218,15 @@ def _median_depth(solution: Solution) -> float:
     return float(np.median(np.concatenate(depths))) if depths else 0.0
 
 
-def warnings_of(attempt: Attempt, names: list[str], unsharp: Sequence[int] = ()) -> list[str]:
+def warnings_of(
+    attempt: Attempt, names: list[str], unsharp: Sequence[int] = (), blank: Sequence[int] = ()
+) -> list[str]:
     """What the user should know of a reconstruction that stands: views left out, and a guess.
 
     Args:
         names: how the user knows the photographs.
         unsharp: those that are shaken or out of focus.
+        blank: those that show an even surface and nothing else.
     """
     solution = attempt.solution
     if solution is None:
@@ -204,17 +234,18 @@ def warnings_of(attempt: Attempt, names: list[str], unsharp: Sequence[int] = ())
     unplaced = [view for view in range(len(names)) if view not in solution.poses]
     result = []
     if unplaced:
-        reasons = " ".join(
-            _why_unplaced(attempt.evidence, names, view, set(solution.poses), unsharp)
-            for view in unplaced[:MOST_NAMED]
-        )
-        soft = [names[view] for view in unplaced if view in unsharp]
-        if soft:
-            reasons = f"{_too_soft(soft)} {reasons}"
-        result.append(
+        placed = set(solution.poses)
+        shown = [view for view in unplaced if view not in blank]
+        said = [
             f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
-            f"{_listed([names[view] for view in unplaced])}. {reasons} {HOW_TO_BRIDGE}"
-        )
+            f"{_listed([names[view] for view in unplaced])}.",
+            *_bad_ones(names, *([v for v in unplaced if v in bad] for bad in (unsharp, blank))),
+            *(
+                _why_unplaced(attempt.evidence, names, view, placed, [*unsharp, *blank])
+                for view in shown[:MOST_NAMED]
+            ),
+        ]
+        result.append(" ".join([*said, HOW_TO_BRIDGE] if shown else said))
     if not attempt.focal_determined:
         few = " Two photographs fit nearly any." if len(solution.poses) < 3 else ""
         result.append(f"The focal length is undetermined: it is a guess.{few} {HOW_TO_GIVE_FOCAL}")

@@ -82,6 +82,7 @@ def live_scenes(found: Comparison, places: list[tuple[str, Camera]]) -> Live | N
 
 def _packed(visit: Visit, common_from_world: Array) -> tuple[dict[str, Any], str] | None:
     """A visit's Gaussians in the world of their run, and the way there from the common frame."""
+    from stages.export.viewer.lighter import with_degree
     from stages.export.viewer.page import pack_scene, rasterizer_constants
 
     if visit.gaussians is None:
@@ -89,7 +90,8 @@ def _packed(visit: Visit, common_from_world: Array) -> tuple[dict[str, Any], str
     back = inverted(visit.frame)
     cameras = [in_frame(look.camera, back) for look in visit.looks]
     constants = rasterizer_constants(visit.gaussians, cameras)
-    described, splats = pack_scene(visit.gaussians, _orbit(visit, back), constants, DEGREE)
+    light = with_degree(visit.gaussians, cameras, DEGREE)
+    described, splats = pack_scene(light, _orbit(visit, back), constants, DEGREE)
     world_from_common = inverted(common_from_world)
     scale = scale_of(world_from_common)
     similarity = {
