@@ -70,7 +70,7 @@ def ball_page() -> str:
         scale=MM, teeth=[tooth(11, -0.2, -0.2), tooth(41, -0.1, 0.3)],
         measurements=[
             measurement(),
-            measurement(name="overbite", title="Overbite", value=None, uncertainty=None,
+            measurement(name="hidden", title="Overbite", value=None, uncertainty=None,
                         points=None, not_visible="the upper teeth cover the edges"),
             measurement(name="overbite", title="Overbite", value=3.1, uncertainty=2.2,
                         sure="unsure", estimated=ESTIMATED),
@@ -146,6 +146,11 @@ MEASURE = """(async () => {
   press("Escape");
   document.querySelector("#marks button").click();
   result.left = page.state.marks.length;
+  const estimate = document.querySelector("#measured [data-measure=overbite]");
+  estimate.click();
+  page.render();
+  result.estimate = [...document.querySelectorAll("#drawing .said")].at(-1).textContent;
+  estimate.click();
 
   const whole = colours();
   press("u");
@@ -222,6 +227,7 @@ def test_measuring_and_overlays(tmp_path: Path) -> None:
     assert found["table"][2] == (
         "Overbite3.1 ± 2.2 mmestimated, 38 ± 17 % of the crowns covered; unsure"
     )
+    assert found["estimate"] == "Overbite, estimated: 3.1 ± 2.2 mm"
     assert (found["crosshair"], found["left"]) == (1, 1)
 
     assert found["numbers"] == ["11", "41"]
