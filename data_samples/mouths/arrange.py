@@ -124,7 +124,7 @@ def _plans(
             factor = options.size * np.exp(spread * (0.8 * alike + 0.4 * rng.normal()))
             if fdi in (12, 22) and rng.random() < 0.05:
                 factor *= 0.75  # peg-shaped
-            tall = options.size * np.exp(0.05 * rng.normal() + 0.03 * alike)
+            tall = options.size * options.crown_height * np.exp(0.05 * rng.normal() + 0.03 * alike)
             shown = 1.0
             if options.dentition == "mixed" and not plan.primary and rng.random() < 0.4:
                 shown = float(rng.uniform(0.35, 0.95))

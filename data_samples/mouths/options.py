@@ -26,6 +26,7 @@ class MouthOptions:
         arch_width, arch_power: width of the arches against the textbook's at equal length; exponent
             of their shape (2 a parabola, 3 a U).
         size_spread: relative deviation of the size of each tooth.
+        crown_height: of all crowns against their widths, 1 is the textbook.
         crowding: share of the front teeth's room that is lacking (negative: gaps all over).
         twist, shift, tilt: deviations of each tooth's rotation (deg), place (mm), and lean (deg).
         diastema: gap between the upper central incisors, mm.
@@ -52,6 +53,7 @@ class MouthOptions:
     arch_width: float
     arch_power: float
     size_spread: float
+    crown_height: float
     crowding: float
     twist: float
     shift: float
@@ -180,6 +182,7 @@ def random_options(rng: np.random.Generator, **overrides: Any) -> MouthOptions:
         "arch_width": float(rng.normal(1.0, 0.06)),
         "arch_power": float(rng.uniform(2.0, 2.75)),
         "size_spread": float(rng.uniform(0.015, 0.05)),
+        "crown_height": 1.0,
         "crowding": float(crowding),
         "twist": 3.0 + 14.0 * untidy,
         "shift": 0.2 + 1.1 * untidy,

@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, is_upper, other_side, permanent_of, teeth_of
+from pipeline.artifacts.dental.sizes import WIDTHS
 from pipeline.artifacts.teeth import Teeth
 from pipeline.artifacts.views import View
-from stages.init.dental.template import WIDTHS
 from stages.init.scale import depth_near
 
 Array = npt.NDArray[np.float64]
@@ -136,7 +136,7 @@ def textbook_scale(places: Places) -> tuple[float, float] | None:
         The factor and its relative standard deviation; None: too few neighbours are seen.
 
     Source:
-        Widths of crowns: `stages.init.dental.template.WIDTHS`.
+        Widths of crowns: `pipeline.artifacts.dental.sizes`.
     """
     ratios = []
     for jaw in JAWS:

@@ -9,102 +9,18 @@ import numpy as np
 import pytest
 
 from data_samples.mouths import Mouth, random_mouth
-from data_samples.mouths.cameras import Camera as TrueCamera
-from data_samples.mouths.cameras import look
-from data_samples.mouths.rays import cast, ray_scene
-from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.teeth import Crown, Dentition, filled
-from stages.dentition.crowns import dentition_of
 from stages.export.measuring.landmarks import read_landmarks
 from stages.export.measuring.measures import measure_mouth, mouth_axes
-from tests.stages.mouth_case import CALM, outlines_of
+from tests.stages.measured_mouth import YAWS, photographed, truth
+from tests.stages.mouth_case import CALM
 
-WIDTH, HEIGHT = 640, 480
 MM = {"unit": "mm", "uncertainty_percent": 0.0}
 UP = np.array([0.0, 1.0, 0.0])
-YAWS = ((-42.0, 4.0), (3.0, 4.0), (40.0, 4.0))
 
 
 @cache
 def grown(seed: int, **options: object) -> Mouth:
     return random_mouth(np.random.default_rng(seed), **{**CALM, **options})
-
-
-def photographed(
-    mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS
-) -> tuple[list[Dentition], list[Camera], list[np.ndarray]]:
-    """Exact outlines with true numbers, cameras and depth, from some yaws and pitches."""
-    scene = ray_scene((mouth.vertices, mouth.triangles))
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
-    dentitions, cameras, depths = [], [], []
-    for k, (yaw, pitch) in enumerate(angles):
-        focal = 1.9 * WIDTH
-        true = TrueCamera(
-            WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, look(yaw, pitch, 2.0, 125.0, pivot)
-        )
-        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        hit = cast(scene, true.rays(np.stack([u, v], -1).reshape(-1, 2)))
-        seen = np.isfinite(hit["t_hit"])
-        labels = np.zeros(WIDTH * HEIGHT, np.uint8)
-        labels[seen] = mouth.fdi[mouth.triangles[hit["primitive_ids"][seen], 0]]
-        depth = np.where(seen, hit["t_hit"], 0).reshape(HEIGHT, WIDTH)
-        labels = labels.reshape(HEIGHT, WIDTH)
-        # 18 etc. are no numbers of ours
-        read = dentition_of(outlines_of(labels, tell=False), f"{k:03d}", (WIDTH, HEIGHT), "front")
-        dentitions.append(numbered(read, labels))
-        cameras.append(
-            Camera(f"{k:03d}", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2,
-                   true.cam_from_world)
-        )  # fmt: skip
-        depths.append(depth)
-    return dentitions, cameras, depths
-
-
-def numbered(read: Dentition, labels: np.ndarray) -> Dentition:
-    def named(crown: Crown) -> Crown:
-        inside = labels[filled((crown,), read.size)]
-        return replace(crown, number=int(np.bincount(inside[inside > 0]).argmax()), doubt=0.001)
-
-    return replace(read, upper=tuple(map(named, read.upper)), lower=tuple(map(named, read.lower)))
-
-
-def truth(mouth: Mouth) -> dict[str, float]:
-    """The same values from the crowns' own meshes (mm; x left, y up, z out)."""
-    teeth = {tooth.plan.fdi: tooth for tooth in mouth.teeth}
-
-    def tip(n: int) -> np.ndarray:
-        """Middle of the biting edge, where it turns into the outer face."""
-        tooth = teeth[n]
-        ends = tooth.vertices[:, 1] * (1 if n > 30 else -1)
-        edge = tooth.vertices[ends >= ends.max() - 0.5]
-        out = edge @ tooth.outward
-        return edge[out >= out.max() - 0.2].mean(0)
-
-    def face(n: int, height: float) -> float:
-        """How far out the outer face reaches at a height."""
-        v = teeth[n].vertices
-        return float(v[abs(v[:, 1] - height) < 0.4][:, 2].max())
-
-    def meet(right: int, left: int) -> float:
-        ends = []
-        for n, side in ((right, 1), (left, -1)):
-            tooth = teeth[n]
-            low = tooth.vertices[tooth.local[:, 1] < 0.35 * tooth.plan.height]
-            ends.append(side * (side * low[:, 0]).max())
-        return float(np.mean(ends))
-
-    above, below = (np.mean([tip(a), tip(b)], axis=0) for a, b in ((11, 21), (31, 41)))
-    level = min(above[1], below[1])
-    return {
-        "overjet": above[2] - float(np.mean([face(n, level - 0.4) for n in (31, 41)])),
-        "overbite": below[1] - above[1],
-        "midline_shift": meet(41, 31) - meet(11, 21),
-        "intercanine_upper": float(np.linalg.norm(tip(13) - tip(23))),
-        "intercanine_lower": float(np.linalg.norm(tip(43) - tip(33))),
-        "intermolar_upper": float(np.linalg.norm(teeth[16].labial - teeth[26].labial)),
-        "intermolar_lower": float(np.linalg.norm(teeth[46].labial - teeth[36].labial)),
-    }
 
 
 def measured(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS, scale=MM):
@@ -123,16 +39,94 @@ def test_what_is_measured_is_true_within_its_uncertainty(seed: int, options: dic
     true, found = truth(mouth), measured(mouth)
     assert set(found) == set(true)
     for name, entry in found.items():
-        if entry["value"] is None:
-            assert name == "overbite"
-            assert "cover the edges of the lower ones" in entry["not_visible"]
-            continue
         assert abs(entry["value"] - true[name]) <= entry["uncertainty"], (name, entry, true[name])
         assert entry["uncertainty"] < 5
         assert entry["sure"] in ("sure", "fair", "unsure")
         assert entry["not_visible"] == ""
-    assert (found["overbite"]["value"] is not None) == (options == OPEN)
+        assert (entry["estimated"] is not None) == (name == "overbite" and options != OPEN)
     assert found["overjet"]["uncertainty"] < 2
+
+
+@pytest.mark.parametrize(
+    ("seed", "crown_height", "options"),
+    [
+        (5, 0.87, {"bite": "deep", "overbite": 5.0, "overjet": 3.0}),
+        (6, 1.13, {"overbite": 2.0}),
+        (7, 1.0, {"overbite": 0.8, "recession": 1.5}),
+    ],
+)
+def test_a_covered_overbite_is_estimated_and_said_to_be(
+    seed: int, crown_height: float, options: dict
+) -> None:
+    """Crowns a standard deviation taller and lower than the textbook's, and a receded gum."""
+    mouth = grown(seed, crown_height=crown_height, **options)
+    entry, true = measured(mouth)["overbite"], truth(mouth)["overbite"]
+    assert abs(entry["value"] - true) <= entry["uncertainty"] < 3
+    assert "cover the edges of the lower ones" in entry["estimated"]["because"]
+    assert entry["method"].startswith("estimated, not measured")
+    assert entry["sure"] in ("fair", "unsure")
+    assert entry["not_visible"] == ""
+    assert entry["teeth"] == [11, 21, 31, 41]
+    share, off = (entry["estimated"]["covered_percent" + end] for end in ("", "_uncertainty"))
+    crown = np.mean([t.plan.height for t in mouth.teeth if t.plan.fdi in (31, 41)])
+    assert abs(share - 100 * true / crown) <= off < 40
+    ends = np.array(entry["points"])
+    assert ends[1, 1] - ends[0, 1] == pytest.approx(entry["value"], abs=0.1), "up, behind"
+
+
+def test_an_estimate_follows_the_bite_and_errs_with_the_crowns_height() -> None:
+    def overbite(**options: object) -> float:
+        return measured(grown(8, **options))["overbite"]["value"]
+
+    shallow, deep = overbite(overbite=1.0), overbite(overbite=4.0)
+    assert deep - shallow == pytest.approx(3.0, abs=0.5)
+    assert overbite(overbite=4.0, crown_height=0.9) > deep + 0.4
+
+
+def test_an_estimate_needs_no_scale() -> None:
+    reading = read_landmarks(*photographed(grown(8, overbite=3.0)))
+    larger = replace(
+        reading,
+        landmarks={
+            key: replace(mark, point=7 * mark.point, covariance=49 * mark.covariance)
+            for key, mark in reading.landmarks.items()
+        },
+    )
+    none = {"unit": "none", "uncertainty_percent": None}
+    here, there = (
+        next(e for e in measure_mouth(r, UP, s) if e["name"] == "overbite")
+        for r, s in ((reading, MM), (larger, none))
+    )
+    assert there["value"] == pytest.approx(7 * here["value"], rel=1e-3)
+    assert there["uncertainty"] == pytest.approx(7 * here["uncertainty"], rel=1e-3)
+    assert there["estimated"] == here["estimated"]
+    assert there["unit"] == "none"
+    rough = {"unit": "mm", "uncertainty_percent": 15.0}
+    worse = next(e for e in measure_mouth(reading, UP, rough) if e["name"] == "overbite")
+    assert worse["uncertainty"] == pytest.approx(
+        np.hypot(here["uncertainty"], 1.96 * 0.15 * here["value"]), rel=1e-2
+    )
+
+
+def test_what_can_not_be_estimated_either_says_why() -> None:
+    milk = measured(grown(9, dentition="primary", missing=(), overbite=2.0))["overbite"]
+    assert (milk["value"], milk["estimated"]) == (None, None)
+    assert "cover the edges of the lower ones" in milk["not_visible"]
+    assert "nor is it estimated where there are primary teeth" in milk["not_visible"]
+
+    reverse = measured(grown(10, bite="reverse", overbite=2.0, overjet=-2.5))["overbite"]
+    assert reverse["value"] is None
+    assert "estimated" not in reverse["not_visible"]
+
+    dentitions, cameras, depths = photographed(grown(8, overbite=3.0))
+    cut = [
+        replace(d, lower=tuple(replace(c, doubtful=c.number in (31, 41)) for c in d.lower))
+        for d in dentitions
+    ]
+    found = {e["name"]: e for e in measure_mouth(read_landmarks(cut, cameras, depths), UP, MM)}
+    assert found["overbite"]["value"] is None
+    assert "no photograph shows all of the gum's edge" in found["overbite"]["not_visible"]
+    assert found["overjet"]["value"] is not None
 
 
 def test_sides_are_the_patients() -> None:

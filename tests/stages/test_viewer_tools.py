@@ -43,11 +43,18 @@ def tooth(number: int, x: float, y: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
+#: As `stages.export.measuring.measures` says that a value is no measurement.
+ESTIMATED = {
+    "because": "the upper teeth cover the edges", "covered_percent": 38.2,
+    "covered_percent_uncertainty": 16.8,
+}  # fmt: skip
+
+
 def measurement(**changes: Any) -> dict[str, Any]:
     return {
         "name": "overjet", "title": "Overjet", "method": "how", "value": 2.5, "uncertainty": 0.4,
         "unit": "mm", "sure": "sure", "doubt": 0.0, "direction": "", "teeth": [11, 41],
-        "points": [[0, -0.1, -1], [0, 0.1, -1]], "not_visible": "",
+        "points": [[0, -0.1, -1], [0, 0.1, -1]], "estimated": None, "not_visible": "",
     } | changes  # fmt: skip
 
 
@@ -63,8 +70,10 @@ def ball_page() -> str:
         scale=MM, teeth=[tooth(11, -0.2, -0.2), tooth(41, -0.1, 0.3)],
         measurements=[
             measurement(),
-            measurement(name="overbite", title="Overbite", value=None, uncertainty=None,
+            measurement(name="hidden", title="Overbite", value=None, uncertainty=None,
                         points=None, not_visible="the upper teeth cover the edges"),
+            measurement(name="overbite", title="Overbite", value=3.1, uncertainty=2.2,
+                        sure="unsure", estimated=ESTIMATED),
         ],
         axes=AXES, jaws=jaws, seen=photographs_that_saw(ball.means, surfaces),
         mesh=(corners, triangles, np.array([1, 1, 2, 2], np.uint8)),
@@ -137,6 +146,11 @@ MEASURE = """(async () => {
   press("Escape");
   document.querySelector("#marks button").click();
   result.left = page.state.marks.length;
+  const estimate = document.querySelector("#measured [data-measure=overbite]");
+  estimate.click();
+  page.render();
+  result.estimate = [...document.querySelectorAll("#drawing .said")].at(-1).textContent;
+  estimate.click();
 
   const whole = colours();
   press("u");
@@ -210,6 +224,10 @@ def test_measuring_and_overlays(tmp_path: Path) -> None:
     assert [text.split()[0] for text in found["marks"]] == ["Distance", "Angle"]
     assert found["table"][0] == "Overjet2.5 ± 0.4 mmsure"
     assert found["table"][1] == "Overbitenot visible: the upper teeth cover the edges"
+    assert found["table"][2] == (
+        "Overbite3.1 ± 2.2 mmestimated, 38 ± 17 % of the crowns covered; unsure"
+    )
+    assert found["estimate"] == "Overbite, estimated: 3.1 ± 2.2 mm"
     assert (found["crosshair"], found["left"]) == (1, 1)
 
     assert found["numbers"] == ["11", "41"]

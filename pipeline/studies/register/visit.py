@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.dental.sizes import millimetres_per_unit
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.errors import RequestError
 from pipeline.geometry.similarity import moved_camera
@@ -173,28 +173,12 @@ def textbook_scale(centres: Mapping[int, Array]) -> float:
     Raises:
         RequestError: no two neighbours.
     """
-    from pipeline.artifacts.dental.fdi import is_primary, is_upper, permanent_of, teeth_of
-    from stages.init.dental.template import PRIMARY_WIDTHS, WIDTHS
-
-    def width(number: int) -> float:
-        table = PRIMARY_WIDTHS if is_primary(number) else WIDTHS
-        row = table["upper" if is_upper(number) else "lower"]
-        return row[min(number % 10, len(row)) - 1]
-
-    places = {permanent_of(n): n for n in centres}
-    ratios = []
-    for jaw in ("upper", "lower"):
-        order = teeth_of(jaw)
-        for one, next_ in pairwise(order):
-            if one in places and next_ in places:
-                a, b = places[one], places[next_]
-                apart = float(np.linalg.norm(centres[a] - centres[b]))
-                ratios.append((width(a) + width(b)) / 2 / max(apart, 1e-9))
-    if not ratios:
+    found = millimetres_per_unit(centres)
+    if found is None:
         raise RequestError(
             "no two neighbouring teeth are known, so nothing says how large they are"
         )
-    return float(np.median(ratios))
+    return found
 
 
 def scale_of(frame: Array) -> float:

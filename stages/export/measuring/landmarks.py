@@ -18,8 +18,9 @@ Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 #: rim: middle of where the crown ends towards the other jaw; tip: the same if that is its biting
 #: edge, not covered by the other jaw; edge: the crown's face beside it; centre: middle of the
-#: crown's face; mesial: where the biting edge ends towards the midline.
-Name = Literal["tip", "rim", "edge", "centre", "mesial"]
+#: crown's face; mesial: where the biting edge ends towards the midline; zenith: where the gum's
+#: edge lies highest on the crown (lowest, in the lower jaw).
+Name = Literal["tip", "rim", "edge", "centre", "mesial", "zenith"]
 
 #: A landmark is read off a photograph to so many pixels, and this share of the crown's height.
 PIXELS, SHARE = 1.0, 0.025
@@ -83,6 +84,11 @@ class Reading:
 
     landmarks: Mapping[tuple[Name, int], Landmark]
     covered: frozenset[int]
+
+    @property
+    def places(self) -> dict[tuple[Name, int], Array]:
+        """(name, FDI number) -> [3]."""
+        return {key: mark.point for key, mark in self.landmarks.items()}
 
     def get(self, name: Name, number: int) -> Landmark | None:
         return self.landmarks.get((name, number))
@@ -163,6 +169,8 @@ def _places(crown: Crown, covered: bool) -> dict[Name, Array]:
     found: dict[Name, Array] = {"rim": crown.tip, "edge": inside, "centre": crown.centre}
     if not covered:
         found["tip"] = crown.tip
+    if not crown.doubtful:  # else the picture's border may have cut it
+        found["zenith"] = crown.zenith
     # A photograph shows the patient's left on its right.
     mesial = crown.embrasure_left if is_left(crown.number) else crown.embrasure_right
     if mesial is not None and crown.number % 10 == 1:

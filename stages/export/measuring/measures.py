@@ -12,13 +12,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import is_left, is_upper, other_side, permanent_of
+from pipeline.artifacts.dental.fdi import is_left, is_upper, other_side
+from stages.export.measuring.covered_bite import (
+    BECAUSE,
+    METHOD,
+    SPREAD,
+    CoveredBite,
+    covered_bite,
+)
 from stages.export.measuring.landmarks import Landmark, Name, Reading
-
-Array = npt.NDArray[np.float64]
-Places = Mapping[tuple[Name, int], Array]
+from stages.export.measuring.places import (
+    Array,
+    Places,
+    centres_of,
+    mean_place,
+    places_of,
+    spacing_of,
+    with_primary,
+)
 
 DRAWS = 100
 #: From a standard deviation to what holds in 19 of 20 cases.
@@ -35,6 +47,8 @@ NOTES = {
     "uncertainty": "holds in 19 of 20 cases, that of the scale included where it is known",
     "sure": "sure, fair or unsure: the uncertainty beside the size of a tooth, and the doubt",
     "doubt": "0..1, that a tooth it is measured at has another number",
+    "estimated": "null: it is measured; else why it can't be, and the share of the covered crowns "
+    "that lies behind the other teeth, in percent, with an uncertainty as above",
 }
 
 
@@ -52,6 +66,7 @@ class Rule:
             of the size of a tooth: from generated mouths, whose crowns are known.
         signs: what a positive and a negative value are called, where there is a sign.
         covered: times less sure where the other jaw covers the edge it is measured at.
+        estimate: what to estimate it at where it can't be measured, or why not; see `covered_bite`.
     """
 
     name: str
@@ -62,6 +77,7 @@ class Rule:
     stands_for: float
     signs: tuple[str, str] = ("", "")
     covered: float = 1.0
+    estimate: Callable[[Reading, float], CoveredBite | str] = lambda reading, most_doubt: ""
 
 
 def measure_mouth(
@@ -77,44 +93,87 @@ def measure_mouth(
 
     Returns:
         One entry a measurement: name, title, method, value, uncertainty, unit, sure, doubt, teeth,
-        points [2][3], direction and not_visible (an empty sentence where there is a value).
+        points [2][3], direction, estimated (None: it is measured) and not_visible (an empty
+        sentence where there is a value).
     """
-    places = {key: mark.point for key, mark in reading.landmarks.items()}
+    places = reading.places
     axes = mouth_axes(places, up)
-    spacing = _spacing(places)
+    spacing = spacing_of(places)
     random = np.random.default_rng(seed)
-    draws = _drawn(reading.landmarks, random)
-    drawn_axes = [mouth_axes(draw, up) for draw in draws]
+    draws = [
+        (draw, turned)
+        for draw in _drawn(reading.landmarks, random)
+        if (turned := mouth_axes(draw, up)) is not None
+    ]
     found = []
     for rule in RULES:
         teeth, missing = _teeth_of(rule, reading, axes)
+        bite = rule.estimate(reading, MOST_DOUBT) if missing and axes is not None else ""
         entry = {
             "name": rule.name, "title": rule.title, "method": rule.method, "value": None,
             "uncertainty": None, "unit": scale["unit"], "sure": None, "doubt": None,
-            "direction": "", "teeth": sorted(teeth), "points": None, "not_visible": missing,
+            "direction": "", "teeth": sorted(teeth), "points": None, "estimated": None,
+            "not_visible": missing,
         }  # fmt: skip
-        if not missing and axes is not None:
-            value, points = rule.measure(_only(places, teeth), axes)
-            values = [
-                rule.measure(_only(draw, teeth), turned)[0]
-                for draw, turned in zip(draws, drawn_axes, strict=True)
-                if turned is not None
-            ]
-            share = rule.stands_for * (rule.covered if teeth & reading.covered else 1.0)
-            off = _WIDE * float(np.hypot(np.std(values), share * spacing))
-            percent = scale.get("uncertainty_percent") or 0.0
-            off = float(np.hypot(off, abs(value) * percent / 100))
-            doubt = _doubt(reading, teeth)
-            entry |= {
-                "value": _rounded(value),
-                "uncertainty": _rounded(off),
-                "doubt": round(doubt, 4),
-                "sure": _sure(off, doubt, spacing),
-                "direction": rule.signs[0 if value >= 0 else 1],
-                "points": [[_rounded(x) for x in point] for point in points],
-            }
+        if axes is not None and isinstance(bite, CoveredBite):
+            entry |= _estimated(rule, bite, places, axes, draws, scale)
+            entry |= _surety(entry["uncertainty"], _doubt(reading, set(bite.teeth)), spacing)
+            if entry["sure"] == "sure":
+                entry["sure"] = "fair"
+        elif axes is not None and not missing:
+            covered = bool(teeth & reading.covered)
+            entry |= _measured(rule, teeth, covered, places, axes, draws, scale)
+            entry |= _surety(entry["uncertainty"], _doubt(reading, teeth), spacing)
+        elif bite:
+            entry["not_visible"] += f"; {bite}"
         found.append(entry)
     return found
+
+
+def _measured(
+    rule: Rule, teeth: set[int], covered: bool, places: Places, axes: Array,
+    draws: Sequence[tuple[Places, Array]], scale: Mapping[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """A value that is measured, and how far it may be off."""
+    value, points = rule.measure(places_of(places, teeth), axes)
+    values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
+    share = rule.stands_for * (rule.covered if covered else 1.0)
+    off = _WIDE * float(np.hypot(np.std(values), share * spacing_of(places)))
+    percent = scale.get("uncertainty_percent") or 0.0
+    return {
+        "value": _rounded(value),
+        "uncertainty": _rounded(float(np.hypot(off, abs(value) * percent / 100))),
+        "direction": rule.signs[0 if value >= 0 else 1],
+        "points": [[_rounded(x) for x in point] for point in points],
+    }
+
+
+def _estimated(
+    rule: Rule, bite: CoveredBite, places: Places, axes: Array,
+    draws: Sequence[tuple[Places, Array]], scale: Mapping[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """The same of one that is estimated: an edge that is covered is not below what covers it."""
+    height, seen = bite.heights(places, axes)
+    value = min(max(height - seen, 0.0), height)
+    heights, seens = np.array([bite.heights(draw, turned) for draw, turned in draws]).T
+    stands_for = rule.stands_for * spacing_of(places)
+    percent = scale.get("uncertainty_percent") or 0.0
+    off = [np.std(heights - seens), stands_for, SPREAD * height, value * percent / 100]
+    share_off = [np.std(seens / heights), stands_for / height, SPREAD * seen / height]
+    return {
+        "method": METHOD,
+        "value": _rounded(value),
+        "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),
+        "direction": rule.signs[0],
+        "teeth": sorted(bite.teeth),
+        "points": [[_rounded(x) for x in p] for p in bite.points(places, axes, value)],
+        "estimated": {
+            "because": BECAUSE,
+            "covered_percent": round(100 * value / height, 1),
+            "covered_percent_uncertainty": round(100 * _WIDE * float(np.linalg.norm(share_off)), 1),
+        },
+        "not_visible": "",
+    }
 
 
 def mouth_axes(places: Places, up: Array) -> Array | None:
@@ -123,7 +182,7 @@ def mouth_axes(places: Places, up: Array) -> Array | None:
     Up is at right angles to the rows of crowns (both at once, each about its own middle); where
     only front teeth are seen it is the photographs', at right angles to the row.
     """
-    centres = {number: point for (name, number), point in places.items() if name == "centre"}
+    centres = centres_of(places)
     jaws = [
         np.array([p for n, p in centres.items() if is_upper(n) == jaw]) for jaw in (True, False)
     ]
@@ -185,7 +244,7 @@ def _teeth_of(rule: Rule, reading: Reading, axes: Array | None) -> tuple[set[int
     teeth: set[int] = set()
     for name, group in rule.needs:
         there = [
-            n for n in _with_primary(group)
+            n for n in with_primary(group)
             if (mark := reading.get(name, n)) is not None and mark.doubt <= MOST_DOUBT
         ]  # fmt: skip
         if not there:
@@ -196,14 +255,10 @@ def _teeth_of(rule: Rule, reading: Reading, axes: Array | None) -> tuple[set[int
     return teeth, ""
 
 
-def _with_primary(group: Sequence[int]) -> list[int]:
-    return [*group, *(n + 40 for n in group if n % 10 <= 5)]
-
-
 def _why(name: Name, group: Sequence[int], rule: Rule, reading: Reading) -> str:
     """Why a landmark can't be had from any of a group of teeth."""
     named = " or ".join(map(str, group))
-    seen = [n for n in _with_primary(group) if reading.get("edge", n) is not None]
+    seen = [n for n in with_primary(group) if reading.get("edge", n) is not None]
     if name == "tip" and all(_covered(group, reading) for _, group in rule.needs):
         return (
             "the edges of the upper and lower teeth meet in every photograph, and either may "
@@ -223,16 +278,7 @@ def _why(name: Name, group: Sequence[int], rule: Rule, reading: Reading) -> str:
 
 
 def _covered(group: Sequence[int], reading: Reading) -> bool:
-    return any(n in reading.covered for n in _with_primary(group))
-
-
-def _only(places: Places, teeth: set[int]) -> Places:
-    return {key: place for key, place in places.items() if key[1] in teeth}
-
-
-def _mean(places: Places, name: Name, group: Sequence[int]) -> Array:
-    there = [places[name, n] for n in _with_primary(group) if (name, n) in places]
-    return np.asarray(np.mean(there, axis=0))
+    return any(n in reading.covered for n in with_primary(group))
 
 
 def _doubt(reading: Reading, teeth: set[int]) -> float:
@@ -243,21 +289,11 @@ def _doubt(reading: Reading, teeth: set[int]) -> float:
     return 1 - right
 
 
-def _spacing(places: Places) -> float:
-    """Median distance between neighbouring crowns: the size of a tooth in these units."""
-    centres = {n: p for (name, n), p in places.items() if name == "centre"}
-    gaps = [
-        float(np.linalg.norm(point - centres[number + 1]))
-        for number, point in centres.items()
-        if permanent_of(number) % 10 < 8 and number + 1 in centres
-    ]
-    return float(np.median(gaps)) if gaps else 0.0
-
-
-def _sure(off: float, doubt: float, spacing: float) -> str:
+def _surety(off: float, doubt: float, spacing: float) -> dict[str, Any]:
+    sure = "fair" if off <= _FAIR * spacing and doubt < 0.2 else "unsure"
     if off <= _SURE * spacing and doubt < 0.05:
-        return "sure"
-    return "fair" if off <= _FAIR * spacing and doubt < 0.2 else "unsure"
+        sure = "sure"
+    return {"doubt": round(doubt, 4), "sure": sure}
 
 
 def _rounded(value: float) -> float:
@@ -265,26 +301,26 @@ def _rounded(value: float) -> float:
 
 
 def _overjet(places: Places, axes: Array) -> tuple[float, Array]:
-    above, below = _mean(places, "rim", (11, 21)), _mean(places, "edge", (31, 41))
+    above, below = mean_place(places, "rim", (11, 21)), mean_place(places, "edge", (31, 41))
     out = float(axes[2] @ (above - below))
     return out, np.array([above, above - out * axes[2]])
 
 
 def _overbite(places: Places, axes: Array) -> tuple[float, Array]:
-    above, below = _mean(places, "tip", (11, 21)), _mean(places, "tip", (31, 41))
+    above, below = mean_place(places, "tip", (11, 21)), mean_place(places, "tip", (31, 41))
     over = float(axes[1] @ (below - above))
     return over, np.array([above, above + over * axes[1]])
 
 
 def _midline(places: Places, axes: Array) -> tuple[float, Array]:
-    above, below = _mean(places, "mesial", (11, 21)), _mean(places, "mesial", (31, 41))
+    above, below = mean_place(places, "mesial", (11, 21)), mean_place(places, "mesial", (31, 41))
     shift = float(axes[0] @ (below - above))
     return shift, np.array([above, above + shift * axes[0]])
 
 
 def _width(name: Name, right: int, left: int) -> Callable[[Places, Array], tuple[float, Array]]:
     def measure(places: Places, axes: Array) -> tuple[float, Array]:
-        ends = np.array([_mean(places, name, (right,)), _mean(places, name, (left,))])
+        ends = np.array([mean_place(places, name, (right,)), mean_place(places, name, (left,))])
         return float(np.linalg.norm(ends[1] - ends[0])), ends
 
     return measure
@@ -315,6 +351,7 @@ RULES = (
         "overbite", "Overbite",
         "how far the upper central incisors reach over the edges of the lower ones",
         (("tip", (11, 21)), ("tip", (31, 41))), _overbite, 0.04, ("", "open"),
+        estimate=covered_bite,
     ),
     Rule(
         "midline_shift", "Midline shift",

@@ -71,8 +71,7 @@ def read_mouth(
         known = np.isfinite(rendered.depth) & (rendered.alpha >= LEAST_ALPHA) & view.valid()
         depths.append(np.where(known, rendered.depth, 0))
     reading = read_landmarks(list(found.values()), shown, depths)
-    places = {key: mark.point for key, mark in reading.landmarks.items()}
-    return Mouth(found, mouth_axes(places, up), measure_mouth(reading, up, scale))
+    return Mouth(found, mouth_axes(reading.places, up), measure_mouth(reading, up, scale))
 
 
 def exported_dentition(dentition: Dentition, view: View) -> Dentition:

@@ -111,7 +111,7 @@ class Marks {
     const text = lengthText(Math.abs(entry.value), entry.uncertainty, scale);
     if (ends[0] && ends[1]) {
       const middle = [(ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2];
-      this.#label(middle, `${entry.title} ${text}`);
+      this.#label(middle, `${entry.title}${entry.estimated ? ", estimated:" : ""} ${text}`);
     }
   }
 

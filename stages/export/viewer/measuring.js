@@ -46,6 +46,13 @@ function lengthText(value, off, scale) {
   return `${value.toFixed(1)} ± ${Math.max(off, 0.1).toFixed(1)} mm${unsaid}`;
 }
 
+/** That a value is no measurement, and what else is known of it; empty where it is one. */
+function estimateText({ estimated }) {
+  if (!estimated) return "";
+  const [share, off] = [estimated.covered_percent, estimated.covered_percent_uncertainty];
+  return `estimated, ${share.toFixed(0)} ± ${off.toFixed(0)} % of the crowns covered`;
+}
+
 /** What a mark of the user's says. */
 function markText(mark, scale) {
   if (mark.kind === "note") return mark.text || "(no text yet)";

@@ -65,7 +65,8 @@ function measurementRow(tools, entry) {
     const shown = signed ? entry.value : Math.abs(entry.value);
     text.textContent = lengthText(shown, entry.uncertainty, scene.scale);
     const small = document.createElement("small");
-    small.textContent = [entry.direction, entry.sure].filter(Boolean).join("; ");
+    small.textContent = [estimateText(entry), entry.direction, entry.sure]
+      .filter(Boolean).join("; ");
     small.dataset.sure = entry.sure;
     value.append(text, document.createElement("br"), small);
   }

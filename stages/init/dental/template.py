@@ -14,29 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.sizes import HEIGHTS, PRIMARY_HEIGHTS, PRIMARY_WIDTHS, WIDTHS
 from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]
 
-#: Mesiodistal widths and visible crown heights, from central incisor to second molar (mm; Wheeler's
-#: dental anatomy, tables of tooth measurements; gum covers some of the height).
-WIDTHS: dict[Jaw, tuple[float, ...]] = {
-    "upper": (8.5, 6.5, 7.6, 7.0, 6.8, 10.0, 9.0),
-    "lower": (5.2, 5.7, 6.9, 7.0, 7.1, 11.0, 10.5),
-}
-HEIGHTS: dict[Jaw, tuple[float, ...]] = {
-    "upper": (9.6, 8.2, 9.0, 7.6, 6.8, 6.2, 5.5),
-    "lower": (8.2, 8.4, 9.3, 8.0, 7.0, 6.6, 5.8),
-}
-#: The same of primary teeth, central incisor to second molar.
-PRIMARY_WIDTHS: dict[Jaw, tuple[float, ...]] = {
-    "upper": (6.5, 5.1, 7.0, 7.3, 8.2),
-    "lower": (4.2, 4.1, 5.0, 7.7, 9.9),
-}
-PRIMARY_HEIGHTS: dict[Jaw, tuple[float, ...]] = {
-    "upper": (6.0, 5.6, 6.5, 5.1, 5.7),
-    "lower": (5.0, 5.2, 6.0, 6.0, 5.5),
-}
 #: Half width and depth of each arch's curve (mm).
 ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (30.5, 46.0), "lower": (28.0, 43.0)}
 #: How far the lower incisors reach up behind the upper ones, and lie behind them (mm).

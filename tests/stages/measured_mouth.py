@@ -1,0 +1,99 @@
+"""Generated mouths in photographs with exact outlines, numbers, cameras and depth, and what is true
+of them by their own meshes: for what `stages.export.measuring` says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from data_samples.mouths import Mouth
+from data_samples.mouths.cameras import Camera as TrueCamera
+from data_samples.mouths.cameras import look
+from data_samples.mouths.rays import cast, ray_scene
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.teeth import Crown, Dentition, filled
+from stages.dentition.crowns import dentition_of
+from tests.stages.mouth_case import outlines_of
+
+WIDTH, HEIGHT = 640, 480
+#: Degrees from the patient's left, and from above.
+YAWS = ((-42.0, 4.0), (3.0, 4.0), (40.0, 4.0))
+
+
+def photographed(
+    mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS
+) -> tuple[list[Dentition], list[Camera], list[np.ndarray]]:
+    """Exact outlines with true numbers, cameras and depth, from some yaws and pitches."""
+    scene = ray_scene((mouth.vertices, mouth.triangles))
+    centres = np.array(list(mouth.tooth_centres().values()))
+    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
+    dentitions, cameras, depths = [], [], []
+    for k, (yaw, pitch) in enumerate(angles):
+        focal = 1.9 * WIDTH
+        true = TrueCamera(
+            WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, look(yaw, pitch, 2.0, 125.0, pivot)
+        )
+        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        hit = cast(scene, true.rays(np.stack([u, v], -1).reshape(-1, 2)))
+        seen = np.isfinite(hit["t_hit"])
+        labels = np.zeros(WIDTH * HEIGHT, np.uint8)
+        labels[seen] = mouth.fdi[mouth.triangles[hit["primitive_ids"][seen], 0]]
+        depth = np.where(seen, hit["t_hit"], 0).reshape(HEIGHT, WIDTH)
+        labels = labels.reshape(HEIGHT, WIDTH)
+        # 18 etc. are no numbers of ours
+        read = dentition_of(outlines_of(labels, tell=False), f"{k:03d}", (WIDTH, HEIGHT), "front")
+        dentitions.append(numbered(read, labels))
+        cameras.append(
+            Camera(f"{k:03d}", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2,
+                   true.cam_from_world)
+        )  # fmt: skip
+        depths.append(depth)
+    return dentitions, cameras, depths
+
+
+def numbered(read: Dentition, labels: np.ndarray) -> Dentition:
+    def named(crown: Crown) -> Crown:
+        inside = labels[filled((crown,), read.size)]
+        return replace(crown, number=int(np.bincount(inside[inside > 0]).argmax()), doubt=0.001)
+
+    return replace(read, upper=tuple(map(named, read.upper)), lower=tuple(map(named, read.lower)))
+
+
+def truth(mouth: Mouth) -> dict[str, float]:
+    """The same values from the crowns' own meshes (mm; x left, y up, z out)."""
+    teeth = {tooth.plan.fdi: tooth for tooth in mouth.teeth}
+
+    def tip(n: int) -> np.ndarray:
+        """Middle of the biting edge, where it turns into the outer face."""
+        tooth = teeth[n]
+        ends = tooth.vertices[:, 1] * (1 if n > 30 else -1)
+        edge = tooth.vertices[ends >= ends.max() - 0.5]
+        out = edge @ tooth.outward
+        return edge[out >= out.max() - 0.2].mean(0)
+
+    def face(n: int, height: float) -> float:
+        """How far out the outer face reaches at a height."""
+        v = teeth[n].vertices
+        return float(v[abs(v[:, 1] - height) < 0.4][:, 2].max())
+
+    def meet(right: int, left: int) -> float:
+        ends = []
+        for n, side in ((right, 1), (left, -1)):
+            tooth = teeth[n]
+            low = tooth.vertices[tooth.local[:, 1] < 0.35 * tooth.plan.height]
+            ends.append(side * (side * low[:, 0]).max())
+        return float(np.mean(ends))
+
+    above, below = (np.mean([tip(a), tip(b)], axis=0) for a, b in ((11, 21), (31, 41)))
+    level = min(above[1], below[1])
+    return {
+        "overjet": above[2] - float(np.mean([face(n, level - 0.4) for n in (31, 41)])),
+        "overbite": below[1] - above[1],
+        "midline_shift": meet(41, 31) - meet(11, 21),
+        "intercanine_upper": float(np.linalg.norm(tip(13) - tip(23))),
+        "intercanine_lower": float(np.linalg.norm(tip(43) - tip(33))),
+        "intermolar_upper": float(np.linalg.norm(teeth[16].labial - teeth[26].labial)),
+        "intermolar_lower": float(np.linalg.norm(teeth[46].labial - teeth[36].labial)),
+    }
