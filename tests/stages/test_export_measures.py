@@ -102,10 +102,11 @@ def test_an_estimate_needs_no_scale() -> None:
     assert there["estimated"] == here["estimated"]
     assert there["unit"] == "none"
     rough = {"unit": "mm", "uncertainty_percent": 15.0}
-    worse = next(e for e in measure_mouth(reading, UP, rough) if e["name"] == "overbite")
-    assert worse["uncertainty"] == pytest.approx(
-        np.hypot(here["uncertainty"], 1.96 * 0.15 * here["value"]), rel=1e-2
-    )
+    sure, worse = measure_mouth(reading, UP, MM), measure_mouth(reading, UP, rough)
+    for one, other in zip(sure, worse, strict=True):
+        if one["value"] is not None:  # measured or estimated, it holds in 19 of 20 cases
+            wider = np.hypot(one["uncertainty"], 1.96 * 0.15 * one["value"])
+            assert other["uncertainty"] == pytest.approx(wider, rel=1e-2)
 
 
 def test_what_can_not_be_estimated_either_says_why() -> None:
@@ -145,17 +146,8 @@ def test_a_tooth_that_is_not_there_is_named() -> None:
     assert found["intercanine_lower"]["value"] is not None
 
 
-def test_doubtful_numbers_give_nothing_and_the_scale_counts() -> None:
+def test_doubtful_numbers_give_nothing() -> None:
     dentitions, cameras, depths = photographed(grown(0))
-    reading = read_landmarks(dentitions, cameras, depths)
-    exact = {e["name"]: e for e in measure_mouth(reading, UP, MM)}
-    rough = {
-        e["name"]: e for e in measure_mouth(reading, UP, {"unit": "mm", "uncertainty_percent": 15})
-    }
-    width = exact["intermolar_upper"]
-    assert rough["intermolar_upper"]["uncertainty"] == pytest.approx(
-        np.hypot(width["uncertainty"], 0.15 * width["value"]), rel=0.01
-    )
     unsure = [replace(d, upper=tuple(replace(c, doubt=0.7) for c in d.upper)) for d in dentitions]
     found = {e["name"]: e for e in measure_mouth(read_landmarks(unsure, cameras, depths), UP, MM)}
     assert found["overjet"]["not_visible"] == "it is not sure which tooth is 11 or 21"

@@ -138,11 +138,11 @@ def _measured(
     value, points = rule.measure(places_of(places, teeth), axes)
     values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
     share = rule.stands_for * (rule.covered if covered else 1.0)
-    off = _WIDE * float(np.hypot(np.std(values), share * spacing_of(places)))
     percent = scale.get("uncertainty_percent") or 0.0
+    off = [np.std(values), share * spacing_of(places), value * percent / 100]
     return {
         "value": _rounded(value),
-        "uncertainty": _rounded(float(np.hypot(off, abs(value) * percent / 100))),
+        "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),
         "direction": rule.signs[0 if value >= 0 else 1],
         "points": [[_rounded(x) for x in point] for point in points],
     }

@@ -15,7 +15,7 @@ function distanceOf([a, b], scale) {
   const towards = unit(minus(b.point, a.point));
   const variance = varianceAlong(a, towards) + varianceAlong(b, towards);
   const ofScale = value * (scale.uncertainty_percent ?? 0) / 100;
-  return { value, off: Math.hypot(WIDE * Math.sqrt(variance), ofScale) };
+  return { value, off: WIDE * Math.hypot(Math.sqrt(variance), ofScale) };
 }
 
 /** The angle at the second of three places, in degrees. */
