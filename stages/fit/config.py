@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from pipeline.stage import runtime
 from stages.fit.parts.base import Part
 from stages.fit.parts.camera import Background, Exposure, Focal, Poses
+from stages.fit.parts.colours import Colours
 from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
 from stages.fit.parts.detail import Detail
 from stages.fit.parts.light import Light
@@ -34,12 +35,12 @@ from stages.fit.settings import (
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
     Progressive, Filling, Shading, Saturation, Coarse, Detail, Exposure, Background, Depth, Flow,
-    Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters,
+    Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters, Colours,
 )  # fmt: skip
 PartName = Literal[
-    "background", "coarse", "density", "depth", "detail", "exposure", "filling", "floaters", "flow",
-    "focal", "isotropic", "light", "mcmc", "poses", "progressive", "saturation", "shading",
-    "surface", "variation", "warp",
+    "background", "coarse", "colours", "density", "depth", "detail", "exposure", "filling",
+    "floaters", "flow", "focal", "isotropic", "light", "mcmc", "poses", "progressive", "saturation",
+    "shading", "surface", "variation", "warp",
 ]  # fmt: skip
 
 
@@ -50,7 +51,7 @@ class Basics(PartSettings):
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
     bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
     same images and gradients in a first trial)"""
-    iterations: AutoInt = automatic({3: 400, 6: 500, 9: 700}, held=240, ge=1)
+    iterations: AutoInt = automatic({3: 400, 6: 500, 9: 700}, held=160, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
     # larger views of what isn't held don't need more: with twice as many at 1024 px, unseen views
@@ -92,10 +93,11 @@ class Basics(PartSettings):
 
 
 class FitConfig(
-    Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings, Density.Settings,
-    Detail.Settings, Warp.Settings, Surface.Settings, Isotropic.Settings, Focal.Settings,
-    Progressive.Settings, Poses.Settings, Coarse.Settings, Variation.Settings, Depth.Settings,
-    Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
+    Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings,
+    Density.Settings, Detail.Settings, Warp.Settings, Surface.Settings, Isotropic.Settings,
+    Focal.Settings, Progressive.Settings, Poses.Settings, Coarse.Settings, Variation.Settings,
+    Depth.Settings, Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings,
+    Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 

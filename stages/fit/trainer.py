@@ -209,6 +209,21 @@ class Trainer:
         degree = 0 if self.lit else min(self.settings.sh_degree, isqrt(terms) - 1)
         return rasterize(self.packed, viewpoint, degree=degree, near=self.settings.near)
 
+    def draw(self, viewpoint: Viewpoint, colours: Floats) -> Rendering:
+        """Colours [N, 3] as they are, in place of those of the Gaussians."""
+        return rasterize(
+            self.packed, viewpoint, degree=None, near=self.settings.near,
+            features=np.ascontiguousarray(colours, np.float32),
+        )  # fmt: skip
+
+    def missing(self, view: int, factor: int = 1) -> tuple[Rendering, Floats]:
+        """A view as it is now, and [3, H, W] what its photograph shows beyond."""
+        rendering, colour = self.render(view, factor), self.targets[view][factor].colour
+        error = colour.target - self.composited(view, rendering)
+        # what the camera clipped may be brighter
+        error[(colour.target >= self.settings.saturation) & (error < 0)] = 0
+        return rendering, error
+
     def shade(self, viewpoint: Viewpoint) -> None:
         """Bring the colours up to date with where they are seen from."""
         for part in self.parts:

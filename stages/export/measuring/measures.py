@@ -139,7 +139,7 @@ def _measured(
     values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
     share = rule.stands_for * (rule.covered if covered else 1.0)
     percent = scale.get("uncertainty_percent") or 0.0
-    off = [np.std(values), share * spacing_of(places), value * percent / 100]
+    off = [float(np.std(values)), share * spacing_of(places), value * percent / 100]
     return {
         "value": _rounded(value),
         "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stages.fit.numerics import (  # noqa: F401
         background,
+        colours,
         density,
         detail,
         light,

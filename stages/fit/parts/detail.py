@@ -104,11 +104,7 @@ def unexplained(fit: Trainer, factor: int, times: float, least: float) -> tuple[
     excess, area = np.zeros((2, len(fit.packed)))
     for view, target in enumerate(fit.targets):
         colour = target[factor].colour
-        rendering = fit.render(view, factor)
-        image = fit.composited(view, rendering)
-        error = colour.target - image
-        # what the camera clipped may be brighter
-        error[(colour.target >= fit.settings.saturation) & (error < 0)] = 0
+        rendering, error = fit.missing(view, factor)
         own = noise_level(colour.target.mean(0), colour.mask)
         noise = max(times * own, least)
         planes = np.zeros_like(rendering.planes)

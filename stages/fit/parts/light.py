@@ -139,8 +139,7 @@ class Light(
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall
         self.by_normal = result.material[:, 3:]
         self.adam.step(self.material, result.material, rates)
-        # a black albedo has no slope to come back by
-        np.maximum(self.material[:, :3], np.float32(2e-3), out=self.material[:, :3])
+        self._not_black()
         if self.adam.steps % RENORMALISE == 0:
             self.material[:, 3:] = self.normals()
         self._step_light(result.light, fall)
@@ -165,6 +164,30 @@ class Light(
         moved = self.values * np.exp(move)
         moved[0], moved[1] = odds / (1 + odds), self.values[1] + move[1]
         self.values = np.clip(moved, LOWEST, HIGHEST)
+
+    def by_albedo(self, packed: Floats, viewpoint: Viewpoint) -> Floats:
+        """[N, 3] slope of the colours that a view sees, by the albedos."""
+        from stages.splatting.kernels.features import C0
+        from stages.splatting.kernels.projection import HARMONICS
+        from stages.splatting.light import shade_backward
+
+        self.shade(packed, viewpoint)
+        one = np.zeros_like(packed)
+        one[:, HARMONICS : HARMONICS + 3] = C0  # a colour is .5 + C0 times its harmonic
+        slopes = shade_backward(
+            packed, self.material, viewpoint.centre, viewpoint.pose, self.coefficients(),
+            self.radiance, one,
+        )  # fmt: skip
+        return slopes.material[:, :3].copy()
+
+    def brighten(self, move: Floats) -> None:
+        """Add [N, 3] to the albedos."""
+        self.material[:, :3] += move
+        self._not_black()
+
+    def _not_black(self) -> None:
+        # a black albedo has no slope to come back by
+        np.maximum(self.material[:, :3], np.float32(2e-3), out=self.material[:, :3])
 
     def normals(self) -> Floats:
         """[N, 3] unit normals."""

@@ -69,7 +69,9 @@ class Coarse(Part, absent={"coarse_fraction": 0.0}):
     """Images are small at first."""
 
     class Settings(PartSettings):
-        coarse_fraction: Share = 0.7
+        # on a held surface full size is where steps tell: 160 of them, half at full size, come to
+        # more than 240 with three tenths, now that the colours are solved for at the end
+        coarse_fraction: AutoFloat = automatic({3: 0.7}, held=0.5, le=1)
         """share of the iterations at reduced size"""
         coarse_factor: Annotated[Count, Field(le=16)] = 2
         """by which factor images are reduced at first; it is halved until it is 1"""
