@@ -32,7 +32,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 13
+    version = 14
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -69,7 +69,10 @@ def from_teeth(context: StageContext, views: Views) -> None:
         if isinstance(numbered, TeethArtifact):
             doubtful.artifacts["teeth"] = updated(read, numbered.views)
         raise
-    for doubt in (*teeth.fit.doubts, *turned_back(names, teeth), *misnamed(names, teeth)):
+    for doubt in (
+        *teeth.fit.doubts, *in_another_light(names, teeth), *turned_back(names, teeth),
+        *misnamed(names, teeth),
+    ):  # fmt: skip
         context.warn(doubt)
     context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
     _write(context, given, teeth)
@@ -119,6 +122,20 @@ def turned_back(names: list[str], teeth: Reconstruction) -> list[str]:
         f"{names[k]} is a mirror image: the patient's right is on its left where the other "
         "photographs have it on theirs. It was turned over."
         for k in teeth.mirrored
+    ]
+
+
+def in_another_light(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of a photograph whose colours alone would make it another patient's."""
+    figures = teeth.fit.figures
+    if not figures.get("same_mouth_one_light", 0.0) < 0 <= figures.get("same_mouth", 0.0):
+        return []
+    placed = [name for name, view in zip(names, teeth.fit.views, strict=True) if view is not None]
+    odd = max(range(len(placed)), key=lambda k: figures[f"colour_{k}"])
+    return [
+        f"{placed[odd]} was taken in another light than the others, or with another white balance "
+        "(phones choose one for each photograph). Teeth and gums agree in what that does not "
+        "change; if it shows another patient all the same, leave it out."
     ]
 
 

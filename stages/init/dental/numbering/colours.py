@@ -1,10 +1,14 @@
 """Do photographs show the same teeth and gums, by their colours?
 
 One flash and one camera take a patient's photographs within a minute: whatever the exposure, enamel
-and gum keep their hue, and their contrast to each other. Between patients all three differ.
+and gum keep their hue, and their contrast to each other. Between patients all three differ. Where a
+phone chooses a white balance for each photograph, hues say nothing any more: what stays is how much
+darker the gum is than the enamel in each channel, which a gain for each channel does not change.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,20 +22,54 @@ Image = npt.NDArray[np.float32]
 #: Median distances between photographs of one patient (CIE Lab; 12 patients of two clinics): hue of
 #: the enamel, hue of the gum, and lightness of one over the other. Between patients: 8, 12 and 6.
 ENAMEL_HUE, GUM_HUE, CONTRAST = 2.2, 4.2, 2.2
+#: Standard deviations between photographs of one patient (the same ones) of the logarithm of gum
+#: over enamel: mean of the channels, green over red, blue over green.
+LOG_CONTRASTS = np.array([0.157, 0.137, 0.069])
 #: Enamel brighter than this is a highlight.
 HIGHLIGHT = 95.0
 #: The gum looked at lies between these distances from the teeth (shares of the band).
 GUM_NEAR, GUM_FAR = 0.03, 0.12
+#: Light that counts as none, of 0..1.
+DARK = 1e-4
 
 
-def tissue_colours(image: Image, dentition: Dentition) -> Array | None:
-    """[6] median CIE Lab of enamel and of the gum beside it; None where too little is seen.
+@dataclass(frozen=True)
+class Tissue:
+    """What enamel and the gum beside it look like in a photograph.
+
+    Attributes:
+        lab: [6] median CIE Lab of either.
+        contrasts: [3] logarithms of the gum's median over the enamel's in linear light: mean of the
+            channels, green over red, blue over green.
+    """
+
+    lab: Array
+    contrasts: Array
+
+
+@dataclass(frozen=True)
+class ColourDistance:
+    """How far a photograph's colours are from those of the other most like it; 1 is what
+    photographs of one patient differ by, 0 where nothing can be said.
+
+    Attributes:
+        one_light: if one light and one white balance took them all.
+        any_light: whatever gain the camera gave each channel.
+    """
+
+    one_light: float
+    any_light: float
+
+
+def tissue_colours(image: Image, dentition: Dentition) -> Tissue | None:
+    """Colours of enamel and of the gum beside it; None where too little is seen.
 
     Args:
         image: [H, W, 3] float32 sRGB in 0..1.
         dentition: the teeth in it.
     """
-    lab = cv2.cvtColor(np.ascontiguousarray(np.clip(image, 0, 1)), cv2.COLOR_RGB2Lab)
+    rgb = np.ascontiguousarray(np.clip(image, 0, 1))
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab)
     teeth = dentition.mask.astype(np.uint8)
     inside = cv2.erode(teeth, np.ones((5, 5), np.uint8)) > 0
     enamel = inside & (lab[..., 0] < HIGHLIGHT)
@@ -39,21 +77,35 @@ def tissue_colours(image: Image, dentition: Dentition) -> Array | None:
     gum = (away > GUM_NEAR) & (away < GUM_FAR)
     if min(enamel.sum(), gum.sum()) < 50:
         return None
-    return np.concatenate([np.median(lab[enamel], axis=0), np.median(lab[gum], axis=0)])
+    logs = [np.log(np.maximum(_linear(np.median(rgb[where], axis=0)), DARK))
+            for where in (enamel, gum)]  # fmt: skip
+    red, green, blue = logs[1] - logs[0]
+    return Tissue(
+        np.concatenate([np.median(lab[enamel], axis=0), np.median(lab[gum], axis=0)]),
+        np.array([(red + green + blue) / 3, green - red, blue - green]),
+    )
 
 
-def colour_distances(images: list[Image], dentitions: list[Dentition]) -> list[float]:
-    """How far each photograph's colours are from those of the other most like it.
-
-    1 is what photographs of one patient differ by; 0 where nothing can be said.
-    """
-    colours = [tissue_colours(*pair) for pair in zip(images, dentitions, strict=True)]
+def colour_distances(images: list[Image], dentitions: list[Dentition]) -> list[ColourDistance]:
+    """How far each photograph's colours are from those of the other most like it."""
+    tissues = [tissue_colours(*pair) for pair in zip(images, dentitions, strict=True)]
     result = []
-    for k, mine in enumerate(colours):
-        others = [c for j, c in enumerate(colours) if j != k and c is not None]
-        near = [] if mine is None else [_distance(mine, other) for other in others]
-        result.append(min(near, default=0.0))
+    for k, mine in enumerate(tissues):
+        others = [t for j, t in enumerate(tissues) if j != k and t is not None]
+        if mine is None or not others:
+            result.append(ColourDistance(0.0, 0.0))
+            continue
+        result.append(
+            ColourDistance(
+                min(_distance(mine.lab, other.lab) for other in others),
+                min(_contrast_distance(mine, other) for other in others),
+            )
+        )
     return result
+
+
+def _linear(srgb: Array) -> Array:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _distance(a: Array, b: Array) -> float:
@@ -61,3 +113,7 @@ def _distance(a: Array, b: Array) -> float:
     gum = np.hypot(a[4] - b[4], a[5] - b[5]) / GUM_HUE
     contrast = ((a[0] - a[3]) - (b[0] - b[3])) / CONTRAST
     return float(np.sqrt(enamel**2 + gum**2 + contrast**2))
+
+
+def _contrast_distance(a: Tissue, b: Tissue) -> float:
+    return float(np.linalg.norm((a.contrasts - b.contrasts) / LOG_CONTRASTS))

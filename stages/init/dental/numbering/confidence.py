@@ -13,6 +13,7 @@ from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.numbering.colours import ColourDistance
 from stages.init.dental.numbering.hypotheses import Scored, Scorer
 from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
 
@@ -65,7 +66,7 @@ class Evidence:
             others (`edits.common_mouth`).
         mirrored: of photographs from the front, twice the log Bayes factor that they are mirror
             images (`mirrored.mirror_evidence`).
-        colours: per photograph, how far its colours are from the others' (`colours`).
+        colours: per photograph, how far its colours are from the others'.
         bands: per photograph, the height of its band of teeth, pixels.
         pairs: how the dense matches of pairs agree.
     """
@@ -73,21 +74,51 @@ class Evidence:
     margins: tuple[float, float, float]
     common_mouth: Sequence[float]
     mirrored: Mapping[int, float]
-    colours: Sequence[float]
+    colours: Sequence[ColourDistance]
     bands: Sequence[float]
     pairs: dict[tuple[int, int], PairFigures]
 
 
-def same_mouth(common: float, colour: float, options: ArchOptions) -> float:
-    """How sure it is that a photograph shows the same mouth as the others; below 0: doubt.
+@dataclass(frozen=True)
+class SameMouth:
+    """How sure it is that all photographs show one mouth; below 0: doubt.
 
-    Args:
-        common: twice the log Bayes factor by the places of the teeth.
-        colour: distance of its colours from the others'.
+    Attributes:
+        one_light: if one light took them all.
+        any_light: if the camera chose a white balance for each.
+        odd: the photograph that fits the others worst, by its place in the row.
     """
-    return common / options.common_mouth_unit + options.colour_weight * (
-        options.max_colour - colour
-    )
+
+    one_light: float
+    any_light: float
+    odd: int
+
+    @property
+    def sureness(self) -> float:
+        return max(self.one_light, self.any_light)
+
+
+def same_mouth(evidence: Evidence, options: ArchOptions) -> SameMouth:
+    """Weigh places of the teeth, colours and dense matches, by the photograph that fits worst."""
+    one, other = [], []
+    for view, (common, colour) in enumerate(
+        zip(evidence.common_mouth, evidence.colours, strict=True)
+    ):
+        places = common / options.common_mouth_unit
+        share = max((p.share for pair, p in evidence.pairs.items() if view in pair), default=0.0)
+        one.append(places + options.colour_weight * (options.max_colour - colour.one_light))
+        other.append(
+            options.any_light_places * places
+            + options.any_light_colour_weight * (options.max_colour - colour.any_light)
+            + options.any_light_match_weight * _more_matches(share, options.usual_share)
+            - options.any_light_cost
+        )
+    return SameMouth(min(one), min(other), int(np.argmin(one)))
+
+
+def _more_matches(share: float, usual: float) -> float:
+    """Logarithm of a share of dense matches over the usual one; bounded where there are none."""
+    return float(np.log((share + 0.25 * usual) / usual))
 
 
 def case_confidence(figures: dict[str, float], doubted: bool, options: ArchOptions) -> float:
@@ -128,15 +159,18 @@ def fit_doubts(
             f"{figures['margin']:.0f}, wanted {options.min_margin:.0f}): check the numbers"
         )
     known = scorer.held is not None
-    worst: list[tuple[float, int]] = []
-    for view in range(len(photos)):
-        common, colour = evidence.common_mouth[view], evidence.colours[view]
-        figures[f"common_mouth_{view}"], figures[f"colour_{view}"] = common, colour
-        worst.append((same_mouth(common, colour, options), view))
-    figures["same_mouth"], odd = min(worst)
+    for view, (common, colour) in enumerate(
+        zip(evidence.common_mouth, evidence.colours, strict=True)
+    ):
+        figures[f"common_mouth_{view}"] = common
+        figures[f"colour_{view}"] = colour.one_light
+        figures[f"contrast_{view}"] = colour.any_light
+    one = same_mouth(evidence, options)
+    figures["same_mouth"] = one.sureness
+    figures["same_mouth_one_light"] = one.one_light
     # One photograph of another patient makes all three strangers to each other: the worst is named.
-    if figures["same_mouth"] < 0 and not known:
-        doubts.append(_stranger(photos[odd], places_fit=evidence.common_mouth[odd] > 0))
+    if one.sureness < 0 and not known:
+        doubts.append(_stranger(photos[one.odd], places_fit=evidence.common_mouth[one.odd] > 0))
     for view, factor in evidence.mirrored.items():
         figures[f"mirrored_{view}"] = factor
         if factor > PERHAPS_MIRRORED:

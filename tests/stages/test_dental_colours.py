@@ -1,0 +1,79 @@
+"""Enamel and gum under lights of their own, and what they say of whose mouth it is."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stages.init.dental.cameras.unrolled import PairFigures
+from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.numbering.colours import ColourDistance, colour_distances
+from stages.init.dental.numbering.confidence import Evidence, same_mouth
+
+ENAMEL, GUM = (0.62, 0.55, 0.42), (0.38, 0.16, 0.15)  # linear light
+
+
+def photograph(
+    enamel: tuple[float, ...] = ENAMEL, gum: tuple[float, ...] = GUM, gains: object = 1.0
+) -> tuple[np.ndarray, SimpleNamespace]:
+    """Six crowns in gum, as a camera with these gains shows them."""
+    light = np.tile(np.array(gum), (120, 200, 1))
+    mask = np.zeros((120, 200), bool)
+    for x in range(20, 180, 27):
+        mask[40:80, x : x + 22] = True
+    light[mask] = enamel
+    light = np.clip(light * gains, 0, 1) * np.random.default_rng(0).uniform(0.97, 1.03, light.shape)
+    image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return image.astype(np.float32), SimpleNamespace(mask=mask, band_height=60.0)
+
+
+def distances(*photographs: tuple[np.ndarray, SimpleNamespace]) -> list[ColourDistance]:
+    images, dentitions = zip(*photographs, strict=True)
+    return colour_distances(list(images), list(dentitions))
+
+
+def test_a_white_balance_changes_hues_and_no_contrast() -> None:
+    same = distances(photograph(), photograph(gains=0.8))
+    assert max(d.one_light for d in same) < 1.5 and max(d.any_light for d in same) < 0.1
+    other = distances(photograph(), photograph(gains=(1.15, 1.0, 0.85)))
+    assert min(d.one_light for d in other) > 3
+    assert max(d.any_light for d in other) < 0.1
+
+
+def test_another_patients_gum_is_another_in_any_light() -> None:
+    found = distances(photograph(), photograph(), photograph(gum=(0.30, 0.20, 0.22)))
+    assert found[2].one_light > 3 and found[2].any_light > 3
+    assert max(d.any_light for d in found[:2]) < 0.1
+
+
+def test_a_photograph_without_gum_says_nothing() -> None:
+    image, dentition = photograph()
+    everything = SimpleNamespace(mask=np.ones((120, 200), bool), band_height=60.0)
+    assert distances((image, dentition), (image, everything)) == [ColourDistance(0.0, 0.0)] * 2
+
+
+def evidence(one_light: float, any_light: float, common: float, share: float) -> Evidence:
+    colours = [ColourDistance(1.0, 1.0)] * 2 + [ColourDistance(one_light, any_light)]
+    pairs = {(0, 1): PairFigures(50, 0.04, 0.005), (1, 2): PairFigures(50, share, 0.005)}
+    return Evidence((30.0, 30.0, 30.0), [60.0, 60.0, common], {}, colours, [100.0] * 3, pairs)
+
+
+@pytest.mark.parametrize(
+    ("one_light", "any_light", "common", "share", "same"),
+    [
+        (1.0, 1.0, 40.0, 0.0, True),  # one light: matches are not asked for
+        (5.0, 1.0, 40.0, 0.03, True),  # another light, all else agrees
+        (5.0, 1.0, 40.0, 0.0, False),  # ... but nothing matches
+        (5.0, 4.0, 40.0, 0.03, False),  # ... but gum and enamel differ
+        (5.0, 1.0, -40.0, 0.03, False),  # ... but the teeth stand elsewhere
+    ],
+)
+def test_what_colours_no_longer_say_the_rest_must_make_good(
+    one_light: float, any_light: float, common: float, share: float, same: bool
+) -> None:
+    found = same_mouth(evidence(one_light, any_light, common, share), ArchOptions())
+    assert (found.sureness >= 0) == same
+    assert found.odd == 2 or one_light == 1.0
+    assert found.sureness == max(found.one_light, found.any_light)
