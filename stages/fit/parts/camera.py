@@ -97,7 +97,8 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
     class Settings(PartSettings):
         exposure: bool = False
         """fit a gain and a bias per view and channel, for cameras that change exposure"""
-        exposure_lr: Positive = 1e-3
+        # on a held surface each of three views has some fifty steps
+        exposure_lr: AutoFloat = automatic({3: 1e-3}, held=0.01, ge=None, gt=0)
         """learning rate of exposure"""
 
     def __init__(self, fit: Trainer) -> None:

@@ -135,7 +135,8 @@ def in_another_light(names: list[str], teeth: Reconstruction) -> list[str]:
     return [
         f"{placed[odd]} was taken in another light than the others, or with another white balance "
         "(phones choose one for each photograph). Teeth and gums agree in what that does not "
-        "change; if it shows another patient all the same, leave it out."
+        "change; if it shows another patient all the same, leave it out. --set fit.exposure=true "
+        "evens the colours out."
     ]
 
 
