@@ -32,7 +32,9 @@ class Colours(Part, switch="colour_steps", on=4, off=0):
     class Settings(PartSettings):
         colour_steps: Whole = 4
         """steps of conjugate gradients that solve for the colours at the end; 0: none"""
-        colour_damping: Positive = 0.01
+        # with .01 renders are a little sharper, but what photographs hardly show gets loud colours
+        # there that no photograph has, and that other viewpoints do show
+        colour_damping: Positive = 0.3
         """holds colours where they are: as if this many pixels of each view showed them so"""
 
     def end(self, fit: Trainer) -> None:
