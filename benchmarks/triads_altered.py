@@ -91,7 +91,7 @@ def soft(image: Floats, rng: Rng) -> Altered:
 
 
 def everything(image: Floats, rng: Rng) -> Altered:
-    """All of it, each half as strong as a coin says."""
+    """Each of the others (but `small`) or not, by the toss of a coin."""
     change = np.eye(2, 3)
     for alter in (balance, exposure, turned, cut, soft):
         if rng.random() < 0.5:
