@@ -68,7 +68,7 @@ class ArchOptions:
     #: only by the contrast of gum and enamel, and dense matches by the logarithm of their share
     #: over the usual one; together they must make good what colours no longer say. Chosen on twelve
     #: patients, each altered in seven ways, against the 189 most alike of the 528 mixes of two of
-    #: them: 6 mixes pass, not 5, and with a white balance for each photograph 9 patients of 12,
+    #: them: 7 mixes pass, not 5, and with a white balance for each photograph 9 patients of 12,
     #: not 1.
     any_light_places: float = 0.5
     any_light_colour_weight: float = 2.0
