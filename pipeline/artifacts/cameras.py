@@ -58,18 +58,27 @@ class Camera:
 
     def project(self, points: npt.NDArray[np.floating]) -> tuple[Array, Array]:
         """Project world points [N, 3] to pixels [N, 2] and depths [N]."""
-        local = np.asarray(points, np.float64) @ self.rotation.T + self.translation
-        depth = local[:, 2]
+        x, y, z = np.asarray(points, np.float64).T
+        # Column by column: several times faster than with arrays of rows of two and three.
+        u, v, depth = (a * x + b * y + c * z + t for a, b, c, t in self.cam_from_world[:3].tolist())
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
-        pixels = local[:, :2] / safe[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
+        pixels = np.empty((len(depth), 2))
+        pixels[:, 0] = u / safe * self.fx + self.cx
+        pixels[:, 1] = v / safe * self.fy + self.cy
         return pixels, depth
 
     def unproject(self, depth: npt.NDArray[np.floating]) -> Array:
         """Lift a depth map [H, W] (z, not ray length) to world points [H, W, 3]."""
-        v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+        height, width = depth.shape
         z = np.asarray(depth, np.float64)
-        local = np.stack([(u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z], -1)
-        return np.asarray((local - self.translation) @ self.rotation)
+        across, down = (np.arange(n) + 0.5 for n in (width, height))
+        x = (across - self.cx) / self.fx * z
+        y = ((down - self.cy) / self.fy)[:, None] * z
+        x, y, z = (value - t for value, t in zip((x, y, z), self.translation, strict=True))
+        points = np.empty((height, width, 3))
+        for axis, (a, b, c) in enumerate(self.rotation.T.tolist()):
+            points[..., axis] = a * x + b * y + c * z
+        return points
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resampled to `width` x `height`."""

@@ -104,6 +104,20 @@ class _Watcher(MetaPathFinder):
         return spec
 
 
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """OpenBLAS works in the calling thread alone.
+
+    Our matrices are small, and our threads many: its own threads wait for work by spinning, and
+    took 10 % of a run's processor time (much more where another program computes as well).
+    """
+    import scipy.linalg  # noqa: F401  -- only what is loaded can be told; it brings its own BLAS
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        yield
+
+
 def watch_imports() -> None:
     """From now on, imports of libraries that meddle with the process are watched."""
     if not any(isinstance(finder, _Watcher) for finder in sys.meta_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
@@ -63,21 +64,31 @@ def normals_from_depth(depth: Array, weight: Array, camera: Camera, sigma_px: fl
     known = depth > 0
     inverse = np.where(known, 1.0 / np.where(known, depth, 1), 0.0)
     trust = np.where(known, weight, 0.0)
-    mass = ndimage.gaussian_filter(trust, sigma_px, mode="nearest")
-    smooth = ndimage.gaussian_filter(trust * inverse, sigma_px, mode="nearest")
+    mass, smooth = blurred(trust, sigma_px), blurred(trust * inverse, sigma_px)
     smooth = np.where(mass > 1e-9, smooth / np.maximum(mass, 1e-9), inverse)
     gy, gx = np.gradient(smooth)
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
-    x = (u - camera.cx) / camera.fx
-    y = (v - camera.cy) / camera.fy
-    a, b = gx * camera.fx, gy * camera.fy
-    normal = -np.stack([a, b, smooth - a * x - b * y], -1)
+    height, width = depth.shape
+    x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
+    y = ((np.arange(height) + 0.5 - camera.cy) / camera.fy)[:, None]
+    # Plane by plane: several times faster than with pixels of three.
+    a, b = -gx * camera.fx, -gy * camera.fy
+    c = -smooth - a * x - b * y
+    length = np.maximum(np.sqrt(a * a + b * b + c * c), 1e-12)
+    towards = 1 / np.sqrt(x * x + y * y + 1)
+    facing = -(a * x + b * y + c) / length * towards
     # A slope steeper than grazing comes from a depth jump: turn it just towards the camera.
-    ray = np.stack([x, y, np.ones_like(x)], -1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    facing = -(normal * ray).sum(-1)
-    normal -= np.maximum(0.1 - facing, 0.0)[..., None] * ray
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    world = normal @ camera.rotation
-    return np.where(known[..., None], world, 0.0).astype(np.float32)
+    turn = np.maximum(0.1 - facing, 0.0) * towards
+    a, b, c = a / length - turn * x, b / length - turn * y, c / length - turn
+    length = np.where(known, np.maximum(np.sqrt(a * a + b * b + c * c), 1e-12), np.inf)
+    normals = np.empty((height, width, 3), np.float32)
+    for axis, (r, s, t) in enumerate(camera.rotation.T.tolist()):
+        normals[..., axis] = (r * a + s * b + t * c) / length
+    return normals
+
+
+def blurred(image: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np.float64]:
+    """Gaussian mean of an image [H, W], out to four sigma; its border is repeated."""
+    side = 2 * int(4 * sigma + 0.5) + 1
+    return np.asarray(
+        cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REPLICATE), np.float64
+    )
