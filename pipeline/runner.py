@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from pipeline import profiling
 from pipeline.config import Config
@@ -19,6 +19,7 @@ from pipeline.planning import (
     resolve_chain,
 )
 from pipeline.process import signals
+from pipeline.process.native import one_blas_thread
 from pipeline.running.context import RunContext
 from pipeline.running.failing import explained
 from pipeline.running.outcomes import RunSummary, StageOutcome, figures_of
@@ -54,6 +55,7 @@ class Runner:
         self.config = config
         self.reporter = reporter
         self.store = Store(request.workspace, verify=verify)
+        self._computing: Callable[[str], None] = lambda stage: None
         self.chain = resolve_chain(
             config, request.stages, request.from_stage, request.images_named, self.store
         )
@@ -62,8 +64,13 @@ class Runner:
         """Look at every stage without running any."""
         return plan_chain(self.chain, self.config, self.store, self.request.images)
 
-    def run(self, *, force: bool = False) -> RunSummary:
+    def run(
+        self, *, force: bool = False, computing: Callable[[str], None] | None = None
+    ) -> RunSummary:
         """Run the chain, reusing what is still valid.
+
+        Args:
+            computing: called with the name of each stage that begins to compute.
 
         Raises:
             RequestError: the request is wrong; nothing was written, or the disk is full.
@@ -73,6 +80,7 @@ class Runner:
         self.store.create(self.chain.names)
         self.request.save()
         self.reporter.start(list(self.chain.names))
+        self._computing = computing or self._computing
         try:
             self.reporter.foreseen(self._foreseen(planned, force))
             with self._kernels(stage.name for stage in planned if force or stage.result is None):
@@ -182,6 +190,7 @@ class Runner:
             resumed = self.store.has_checkpoint(name, key)
             reasons = ["--force"] if force and planned.state == "cached" else planned.reasons
             self.reporter.stage_started(name, reasons, resumed)
+            self._computing(name)
             previous = result
             result = self._compute(planned, reasons)
             self.store.use(result, reasons)
@@ -212,7 +221,7 @@ class Runner:
         try:
             folder = self.store.begin(name, key)
             context = RunContext(planned, self.config, self.store, folder, self.reporter)
-            with Measurement() as measurement, self._profiled(name):
+            with Measurement() as measurement, self._profiled(name), one_blas_thread():
                 stage.run(context)
             missing = [kind for kind in stage.provides if kind not in context.outputs]
             if missing:

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError, ReconstructionError, StageError
 from pipeline.front.log import Log
-from pipeline.front.pages import write_pages
+from pipeline.front.pages import DrawnBeside, write_pages
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.runner import Runner
 from pipeline.running.outcomes import RunSummary
@@ -94,16 +94,17 @@ def _logged(log: Log | None, work: Callable[[], RunSummary]) -> RunSummary:
 def _run(
     runner: Runner, workspace: Path, config: Config, reporter: Reporter, force: bool
 ) -> RunSummary:
-    try:
-        summary = runner.run(force=force)
-    except (ReconstructionError, StageError) as error:
-        report, check = write_pages(workspace, config, reporter)
-        if report is not None:
-            reporter.message(f"What came of it so far: {report}")
-        if check and isinstance(error, ReconstructionError) and error.artifacts:
-            error.args = (f"{error} To put it right, open {check} in a browser.",)
-        raise
-    summary.report, summary.check = write_pages(workspace, config, reporter)
+    with DrawnBeside(workspace, config, runner.chain.names) as drawing:
+        try:
+            summary = runner.run(force=force, computing=drawing.stage_started)
+        except (ReconstructionError, StageError) as error:
+            report, check = write_pages(workspace, config, reporter, drawing)
+            if report is not None:
+                reporter.message(f"What came of it so far: {report}")
+            if check and isinstance(error, ReconstructionError) and error.artifacts:
+                error.args = (f"{error} To put it right, open {check} in a browser.",)
+            raise
+        summary.report, summary.check = write_pages(workspace, config, reporter, drawing)
     return summary
 
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Self
 
 from pipeline.config import Config
+from pipeline.errors import PipelineError
 from pipeline.files import sha256_file
-from pipeline.installed import ROOT
+from pipeline.installed import ROOT, module_command
 from pipeline.pages.page import CHECK, REPORT
 from pipeline.running.reporter import Reporter
 from pipeline.store import MANIFEST, Store, read_own, write_sealed
@@ -22,8 +28,67 @@ _SHOWN = ("request.json", "teeth.yaml", "compare/comparison.json", "*/failure.js
 _DRAWING = (".py", ".html", ".css", ".js")
 
 
+class DrawnBeside:
+    """Draws the pages in a process of its own (`pipeline.studies.report.beside`).
+
+    It begins beside the last two stages, which leave a core idle now and then; once they are done,
+    little is left to draw. Use as a context manager: the process ends with it.
+
+    Args:
+        stages: of the run, in order.
+    """
+
+    def __init__(self, workspace: Path, config: Config, stages: Sequence[str]) -> None:
+        self._workspace = workspace.resolve()
+        self._last = stages[-2:] if config.run.report and config.threads > 1 else ()
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+
+    def stage_started(self, stage: str) -> None:
+        """A stage begins to compute."""
+        if stage not in self._last:
+            return
+        if self._process is None:
+            command = [*module_command("pipeline.studies.report.beside"), str(self._workspace)]
+            # what this process found its plug-ins by
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            with suppress(OSError):
+                self._process = subprocess.Popen(
+                    command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
+                )  # fmt: skip
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # it died; the pages are written here then
+                self._process.stdin.write("draw\n")
+                self._process.stdin.flush()
+
+    def write(self) -> None:
+        """Write the pages; here, where the process is not there or does not answer.
+
+        Raises:
+            PipelineError: they can't be written.
+        """
+        from pipeline.studies.report import run_report
+
+        answer = None
+        if self._process is not None:
+            with suppress(OSError, ValueError):
+                answer = json.loads(self._process.communicate("write\n")[0])
+        if answer is None:
+            run_report(self._workspace)
+        elif answer["error"] is not None:
+            raise PipelineError(answer["error"])
+
+
 def write_pages(
-    workspace: Path, config: Config, reporter: Reporter
+    workspace: Path, config: Config, reporter: Reporter, drawing: DrawnBeside
 ) -> tuple[Path | None, Path | None]:
     """Write the report, and the page to put the teeth right where there are any.
 
@@ -35,9 +100,7 @@ def write_pages(
     try:
         state = _state(workspace, config)
         if read_own(workspace / PAGES) != {"made_from": state, **_written(workspace)}:
-            from pipeline.studies.report import run_report
-
-            run_report(workspace)
+            drawing.write()
             write_sealed(workspace / PAGES, {"made_from": state, **_written(workspace)})
     except Exception as error:
         reporter.message(f"The report could not be written: {error}")

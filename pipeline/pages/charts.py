@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.pages.directions import Similarity, frustum, scene_frame
+from pipeline.pages.remembered import remembered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -120,6 +121,7 @@ def _for_the_page(text: str, alt: str) -> str:
     return opening + svg[head.end() :]
 
 
+@remembered
 def match_matrix(names: Sequence[str], table: Mapping[tuple[int, int], int]) -> Chart:
     """Verified matches of every pair of views.
 
@@ -159,6 +161,7 @@ def match_matrix(names: Sequence[str], table: Mapping[tuple[int, int], int]) -> 
     )  # fmt: skip
 
 
+@remembered
 def camera_plot(
     series: Sequence[tuple[str, Sequence[Camera], Similarity | None]],
     points: npt.NDArray[np.floating], colors: npt.NDArray[np.floating], axis: str,
@@ -248,6 +251,7 @@ def flat_cloud(
     return picture, (left, left + width * pixel, bottom, bottom + height * pixel)
 
 
+@remembered
 def line_chart(
     x: Sequence[float], lines: Mapping[str, Sequence[float]], labels: tuple[str, str],
     alt: str, caption: str = "", *, log: bool = False,

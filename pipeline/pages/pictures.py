@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.views import View, read_png, to_uint8
+from pipeline.pages.remembered import remembered
 
 Image = npt.NDArray[np.uint8]
 
@@ -44,6 +45,7 @@ class Picture:
     caption: str = ""
 
 
+@remembered
 def picture(image: Image, alt: str, caption: str = "", long_side: int = LARGE) -> Picture:
     """Pack an image [H, W, 3] uint8 (or grey [H, W]), scaled down to `long_side` if larger."""
     rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
@@ -93,6 +95,7 @@ def thirds(image: Image) -> tuple[Image, Image, Image] | None:
     return first, second, third
 
 
+@remembered
 def points_image(
     positions: npt.NDArray[np.floating], colors: npt.NDArray[np.floating],
     rotation: npt.NDArray[np.float64], size: tuple[int, int] = (640, 460),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import pipeline
 from pipeline.cli import app
 from pipeline.config import load_config
+from pipeline.front.pages import DrawnBeside
 from pipeline.running.outcomes import RunSummary
 from pipeline.running.reporter import Reporter
 
@@ -101,3 +103,47 @@ def test_the_command(toys: Path, capsys: pytest.CaptureFixture[str]) -> None:
     app(["report", "-w", str(toys / "w")], standalone_mode=False)
     assert capsys.readouterr().out.strip() == str(toys / "w" / "report.html")
     assert json.loads((toys / "w" / "request.json").read_text())["overrides"] == ["report=false"]
+
+
+class TestBesideTheRun:
+    """With several threads the pages are drawn in a process of their own."""
+
+    @pytest.fixture
+    def ran(self, named_samples: Path, tmp_path: Path) -> Callable[..., RunSummary]:
+        def call(**options: Any) -> RunSummary:
+            return pipeline.run(
+                named_samples, workspace=tmp_path / "w", stages=["views"],
+                overrides={"run.threads": 2, "views.long_side": 128}, **options,
+            )  # fmt: skip
+
+        return call
+
+    def test_it_writes_them(self, ran: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("pipeline.studies.report.run_report", None)  # not by this process
+        page = ran().report.read_text()
+        assert len(re.findall(r'<img src="data:image/jpeg', page)) == 3
+        assert "could not be drawn" not in page
+
+    def test_the_same_as_this_process_would(self, ran: Any) -> None:
+        beside = re.sub(r"\d\d:\d\d", "", ran().report.read_text())
+        here = re.sub(r"\d\d:\d\d", "", pipeline.run_report(ran().workspace).read_text())
+        assert beside == here
+
+    def test_what_it_can_not_write_is_said(self, ran: Any, tmp_path: Path) -> None:
+        (tmp_path / "w" / "report.html" / "mine").mkdir(parents=True)
+        listener = Listener()
+        assert ran(reporter=listener).report is None
+        assert any("The report could not be written" in text for text in listener.heard)
+
+    def test_when_it_is_killed_this_process_writes_them(
+        self, ran: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        write = DrawnBeside.write
+
+        def killed(drawing: DrawnBeside) -> None:
+            assert drawing._process is not None
+            drawing._process.kill()
+            write(drawing)
+
+        monkeypatch.setattr(DrawnBeside, "write", killed)
+        assert "views" in ran().report.read_text()

@@ -20,7 +20,8 @@ def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     monkeypatch.setitem(KINDS, "numbers", "toy:Numbers")
     monkeypatch.setattr("pipeline.stage._entry_points", lambda: toy.STAGES)
     get_stage.cache_clear()
-    (tmp_path / "toy.yaml").write_text(f"stages: {toy.ORDER}\n")
+    # with one thread a run starts no other process, which would not know the toys
+    (tmp_path / "toy.yaml").write_text(f"stages: {toy.ORDER}\nthreads: 1\n")
     images = tmp_path / "images"
     images.mkdir()
     for index, value in enumerate((1, 2, 4)):

@@ -27,6 +27,7 @@ from pipeline.studies.report.reading import read_case
 
 Some = TypeVar("Some")
 
+TEMPLATE = "run.html"
 #: Names of photographs in the command line that the page shows, and pictures of a failure.
 MOST_NAMED, MOST_PICTURES = 4, 12
 
@@ -51,7 +52,7 @@ def write_run_report(workspace: Path, anonymous: bool = False) -> Path:
     manifests = {record.name: record.manifest for record in case.stages}
     views = _drawn(case, "photographs", lambda case: case.latest("views"), None)
     return write_page(
-        "pipeline.studies.report", "run.html", workspace / (ANONYMOUS if anonymous else REPORT),
+        "pipeline.studies.report", TEMPLATE, workspace / (ANONYMOUS if anonymous else REPORT),
         title="A case" if anonymous else workspace.resolve().name, case=case,
         failed=case.failed, notes=case.hide(case.notes),
         stale=[r for r in case.stages if r.state in ("stale", "pending") and r.result],
