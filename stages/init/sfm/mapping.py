@@ -20,6 +20,9 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Distortions = list[float | None]
 
+#: From this many views on mapping takes long enough to be hurried.
+MANY_VIEWS = 9
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -131,7 +134,10 @@ def map_views(
     if not edges:
         return None
     run = {"incremental": incremental_models, "global": global_models}[method]
-    options = MapperOptions(refine_focal, distortions is not None, max_error, min_tri_angle, seed)
+    options = MapperOptions(
+        refine_focal, distortions is not None, max_error, min_tri_angle, seed,
+        many=len(given.positions) >= MANY_VIEWS,
+    )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=scratch) as name:
         folder = Path(name)
         database = folder / "database.db"
