@@ -9,9 +9,10 @@ amounts; each visit is photographed anew, runs through the whole pipeline, and `
 the two. A mouth whose folder is there already is not made or run again. Lengths are scaled to the
 true size, so that errors are those of the movement; what a scale by textbook teeth adds is said.
 `--exact` compares the same photographs with their true cameras, depths and outlines: what is still
-wrong then does not come from the reconstruction. `--calibrate` says what factor and floors of the
-intervals these mouths ask for, and what coverage each mouth gets from those of the others. After
-that, visits of different mouths are compared, which must be refused.
+wrong then does not come from the reconstruction. `--calibrate` says what factors and floors of the
+intervals these mouths ask for, and what coverage each mouth gets from those of the others, and each
+half of the mouths from those of the other half. After that, visits of different mouths are
+compared, which must be refused.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import argparse
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
-from itertools import permutations, product
+from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +52,20 @@ STAGES = "views,teeth,init,align,sap,flow,fit"
 TARGET = (0.15, 1.5)
 #: Shift and turn among the parts.
 PARTS = (slice(0, 3), slice(3, 6))
-#: Floors of each part (mm, degrees) and factors that are tried. Shading draws the turns of smooth
-#: crowns along in all photographs alike, which no leaving out can show: so turns have a high one.
-FLOORS = ((0.04, 0.06, 0.08, 0.12, 0.2, 0.3), (3.0, 4.0, 5.0))
-#: The factor that just covers enough teeth rests on the worst of a few: others get so much more.
+#: Floors of each part that are tried, mm and degrees.
+FLOORS = (
+    (0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3),
+    (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0),
+)
+#: The floor of each part against that of its kind: rotation is less sure than tip and torque.
+BY_PART = (np.ones(3), np.array([1.0, 1.0, 1.5]))
+#: Share of the teeth that are to be covered, and of the parts; and shares of the shifts and of the
+#: turns that are tried until both are covered in so many teeth.
+COVERED = 0.95
+TRIED = np.arange(COVERED, 1.0, 0.005)
+#: The largest factor of n teeth leaves out one new tooth of n + 1. Where that is more than may be
+#: left out, the factor is made larger by this.
 MARGIN = 1.5
-TRIED = np.arange(1.0, 12.01, 0.25)
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,7 @@ class Errors:
         shift, turn: [T] error, mm and degrees.
         parts, half: [T, 6] error of each part, and half of its stated 95 % interval.
         deviation: [T, 6] that the interval was made from.
+        certain: [T] whether it is said to have moved.
     """
 
     moved: npt.NDArray[np.bool_]
@@ -76,6 +86,7 @@ class Errors:
     parts: Array
     half: Array
     deviation: Array
+    certain: npt.NDArray[np.bool_]
 
     def covered(self, half: Array) -> npt.NDArray[np.bool_]:
         """[T] whether shift and turn are both off by no more than intervals [T, 6] say."""
@@ -136,18 +147,19 @@ def errors_of(found: Comparison, truth: dict[str, Any]) -> Errors:
     known = Truth(found.first, truth)
     axes = tooth_axes(found.first.centres)
     size = np.repeat([known.scale, 1.0], 3)
-    off, half, deviation, moved = [], [], [], []
+    off, half, deviation, moved, certain = [], [], [], [], []
     for tooth in found.teeth:
         true = to_parts(axes[tooth.tooth]) @ known.displacement(tooth.tooth)
         off.append(size * tooth.parts - true)
         half.append(size * tooth.half)
         deviation.append(size * tooth.deviation)
         moved.append(str(tooth.tooth) in truth["motions"])
+        certain.append(tooth.certain)
     parts = np.array(off)
     return Errors(
         np.array(moved), np.linalg.norm(parts[:, :3], axis=1),
         np.linalg.norm(parts[:, 3:], axis=1), parts, np.array(half),
-        np.array(deviation),
+        np.array(deviation), np.array(certain),
     )  # fmt: skip
 
 
@@ -215,49 +227,87 @@ def line(name: str, errors: Errors, which: npt.NDArray[np.bool_]) -> str:
         f"{np.quantile(shift, 0.9):.3f} p90 {shift.max():.3f} max  degrees {np.median(turn):.2f} "
         f"{np.quantile(turn, 0.9):.2f} {turn.max():.2f}  within target {100 * good.mean():.0f} %  "
         f"covered {covered.sum()}/{len(covered)}  parts {100 * inside.mean():.1f} %  "
-        f"interval mm {np.median(far):.2f} degrees {np.median(wide):.1f}"
+        f"interval mm {np.median(far):.2f} degrees {np.median(wide):.1f}  "
+        f"said to have moved {errors.certain[which].sum()}"
     )
 
 
-def calibrated(errors: Errors) -> tuple[float, tuple[float, float]]:
-    """Factor and floors that cover 95 % of the teeth, and of those that moved, most tightly.
+def rank(count: int, share: float) -> int:
+    """So many of some teeth are covered where a new one like them is with this probability.
 
-    The factor has a margin (`MARGIN`).
+    That is split conformal prediction; more than `count` where these are too few to say.
     """
-    best: tuple[float, float, tuple[float, float]] | None = None
-    for floor in product(*FLOORS):
-        factor = 0.0
-        for some in (errors.moved, ~errors.moved):
-            if not some.any():
-                continue
-            each = np.full(int(some.sum()), np.inf)
-            for k in range(len(TRIED) - 1, -1, -1):
-                half = comparing.halves(errors.deviation, TRIED[k], floor)
-                each[errors.covered(half)[some]] = TRIED[k]
-            factor = max(factor, float(np.quantile(each, 0.95, method="higher")))
-        half = comparing.halves(errors.deviation, min(factor, TRIED[-1]), floor)
-        size = sum(float(np.log(np.linalg.norm(half[:, k], axis=1)).mean()) for k in PARTS)
-        if np.isfinite(factor) and (best is None or size < best[0]):
-            best = size, factor, floor
-    if best is None:
-        raise ValueError(f"no factor up to {TRIED[-1]} covers 95 % of the teeth")
-    return MARGIN * best[1], best[2]
+    return int(np.ceil((count + 1) * share))
 
 
-def calibrate(found: list[Errors]) -> None:
-    """Say what the mouths ask for together, and how each fares with what the others ask for."""
-    factor, floor = calibrated(together(found))
-    print(f"calibrated on all: factor {factor:g}, floors {floor[0]:g} mm, {floor[1]:g} degrees")
-    counts = np.zeros(4, int)
-    for k, errors in enumerate(found if len(found) > 1 else []):
-        others = calibrated(together(found[:k] + found[k + 1 :]))
-        good = errors.covered(comparing.halves(errors.deviation, *others))
-        counts += [
-            good[errors.moved].sum(), errors.moved.sum(), good[~errors.moved].sum(),
-            (~errors.moved).sum(),
-        ]  # fmt: skip
-        print(f"  without mouth {k + 1}: {others}; it is covered {good.sum()}/{len(good)}")
-    print("left out one by one: moved {}/{} covered, others {}/{}".format(*counts))
+def enough(factors: Array, share: float) -> float:
+    """The least factor with which a new tooth, like these [N], is covered with this probability."""
+    least = rank(len(factors), share)
+    if least > len(factors):
+        return MARGIN * float(factors.max())
+    return float(np.sort(factors)[least - 1])
+
+
+def tightest(errors: Errors, kind: int, share: float) -> tuple[float, float]:
+    """Factor, and floor times `BY_PART`, of shifts (kind 0) or turns (1): the tightest that do.
+
+    They cover, of those that moved and of the others, this share of the lengths and `COVERED` of
+    the parts.
+    """
+    which, length = PARTS[kind], (errors.shift, errors.turn)[kind]
+    parts, deviation = errors.parts[:, which], np.maximum(errors.deviation[:, which], 1e-9)
+    found = []
+    for least in FLOORS[kind]:
+        floor = least * BY_PART[kind]
+        each = np.sqrt(np.maximum(parts**2 - floor**2, 0)) / deviation
+        whole = np.sqrt(np.maximum(length**2 - (floor**2).sum(), 0) / (deviation**2).sum(1))
+        factor = max(
+            max(enough(whole[some], share), enough(each[some].ravel(), COVERED))
+            for some in (errors.moved, ~errors.moved)
+            if some.any()
+        )
+        half = np.hypot(factor * deviation, floor)
+        found.append((float(np.log(np.linalg.norm(half, axis=1)).mean()), factor, least))
+    return min(found)[1:]
+
+
+def calibrated(errors: Errors) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Factors and floors that cover shift and turn in enough teeth most tightly.
+
+    As `pipeline.studies.register.comparing.halves` takes them.
+    """
+    for share in TRIED:
+        (shift, near), (turn, little) = (tightest(errors, kind, share) for kind in (0, 1))
+        chosen = (shift, turn), (near, little, float(little * BY_PART[1][2]))
+        covered = errors.covered(comparing.halves(errors.deviation, *chosen))
+        if all(
+            covered[some].sum() >= min(rank(int(some.sum()), COVERED), int(some.sum()))
+            for some in (errors.moved, ~errors.moved)
+        ):
+            break
+    return chosen
+
+
+def calibrate(found: dict[int, Errors]) -> None:
+    """Say what the mouths ask for, and how mouths fare with what others ask for.
+
+    Each is judged by all the others, and each half of them by the other half.
+    """
+    factors, floors = calibrated(together(list(found.values())))
+    print(f"calibrated on all: factors {np.round(factors, 2)}, floors {floors} (mm, degrees)")
+    seeds = sorted(found)
+    halves = [set(seeds[0::2]), set(seeds[1::2])]
+    for name, folds in (("one by one", [{s} for s in seeds]), ("by halves", halves)):
+        judged = []
+        for fold in folds if len(seeds) > 1 else []:
+            others = calibrated(together([found[s] for s in seeds if s not in fold]))
+            for seed in sorted(fold):
+                half = comparing.halves(found[seed].deviation, *others)
+                judged.append(replace(found[seed], half=half))
+        if judged:
+            total = together(judged)
+            print(line(f"left out {name}, moved", total, total.moved))
+            print(line(f"left out {name}, others", total, ~total.moved))
 
 
 def together(many: list[Errors]) -> Errors:
@@ -279,7 +329,7 @@ def main() -> None:
     parser.add_argument("--no-pairs", action="store_true", help="leave different mouths out")
     chosen = parser.parse_args()
     visits: dict[int, tuple[Visit, Visit]] = {}
-    found: list[Errors] = []
+    found: dict[int, Errors] = {}
     seeds = range(1, chosen.mouths + 1)
     for seed in map(int, chosen.seeds.split(",")) if chosen.seeds else seeds:
         size = chosen.views, chosen.moved, chosen.width
@@ -295,12 +345,12 @@ def main() -> None:
             print(f"mouth {seed}: {error}")
             continue
         errors = errors_of(compared, truth)
-        found.append(errors)
+        found[seed] = errors
         print(line(f"mouth {seed}, moved", errors, errors.moved))
         print(line(f"mouth {seed}, not moved", errors, ~errors.moved), flush=True)
         print(f"  likeness {compared.likeness:.3f}, in place {compared.share:.2f}", flush=True)
     if found:
-        total = together(found)
+        total = together(list(found.values()))
         print(line("all moved", total, total.moved))
         print(line("all not moved", total, ~total.moved))
         if chosen.calibrate:

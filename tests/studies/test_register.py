@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from pipeline.geometry.rigid import exponential
 from pipeline.studies.register import comparing, movement, run_register, solving
 from pipeline.studies.register.comparing import compare_visits
 from pipeline.studies.register.frame import first_frame
+from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import scale_of, textbook_scale
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import motion, toy_centres, toy_visit, write_visit
@@ -64,6 +66,42 @@ def test_intervals_hold_the_truth_and_say_who_moved(
         assert tooth.certain == (tooth.tooth in motions), tooth.tooth
         assert tooth.still == (tooth.tooth not in motions), tooth.tooth
     assert np.mean(inside) >= 0.95
+
+
+def test_pictures_that_do_not_fit_widen_the_interval(
+    found: comparing.Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One way is enough: where a tooth's pictures hardly agree, its motion may be another one."""
+    doubtful, estimated = 23, comparing.estimate
+    fits: list[dict[int, float]] = []
+
+    def doubted(first, *others):  # type: ignore[no-untyped-def]
+        made = estimated(first, *others)
+        fits.append(made.fits)
+        return replace(made, fits={**made.fits, doubtful: 0.4}) if len(fits) == 1 else made
+
+    monkeypatch.setattr(comparing, "estimate", doubted)
+    plain = {t.tooth: t for t in found.teeth}
+    for tooth in compare_visits(found.first, found.second).teeth:
+        number, before = tooth.tooth, plain[tooth.tooth].deviation
+        wider = 1.0
+        if number == doubtful:
+            wider = misfit(0.4) / misfit(min(way[number] for way in fits))
+            assert wider > 3
+        assert tooth.deviation == pytest.approx(wider * before), number
+
+
+def test_half_of_the_interval_has_a_factor_and_a_floor_of_its_own_for_shifts_and_turns() -> None:
+    half = comparing.halves(np.array([0.0, 0.2, 1.0, 0.0, 2.0, 3.0]), (2.0, 3.0), (0.3, 8.0, 8.0))
+    assert half == pytest.approx([0.3, 0.5, np.hypot(2.0, 0.3), 8.0, 10.0, np.hypot(9.0, 8.0)])
+
+
+def test_doubt_grows_as_pictures_agree_less() -> None:
+    doubts = [misfit(likeness) for likeness in (0.95, USUAL, 0.6, 0.3)]
+    assert doubts == sorted(doubts)
+    assert doubts[1] == pytest.approx(1.0)
+    assert misfit(-0.5) == misfit(0.0) < np.inf
+    assert misfit(1.0) > 0
 
 
 def test_the_scale_between_the_runs_comes_out(found: comparing.Comparison) -> None:

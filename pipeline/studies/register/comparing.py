@@ -15,20 +15,26 @@ from pipeline.studies.register.estimate import Estimate, estimate
 from pipeline.studies.register.frame import first_frame
 from pipeline.studies.register.geometry import inverted, refined_frame
 from pipeline.studies.register.movement import to_parts, tooth_axes
-from pipeline.studies.register.uncertainty import measured
+from pipeline.studies.register.uncertainty import RANGE, measured, misfit
 from pipeline.studies.register.visit import Visit, scale_of
 
 Array = npt.NDArray[np.float64]
 
-#: Half of a 95 % interval in standard deviations as the equations and jackknives give them, with
-#: fewer than six photographs and with more; and what it never falls below (mm, degrees, of each
-#: part). Chosen on generated mouths so that a tooth's shift and its turn are both covered in 95 %
-#: of the teeth, of those that moved alone as well, with a margin: benchmarks/register.py
-#: --calibrate. Turns keep a high floor: what shading does to all photographs alike shows in none
-#: of the jackknives.
-FACTORS = {"few": 4.0, "many": 3.0}
-FLOORS = {"few": (0.15, 3.0), "many": (0.08, 3.0)}
+#: Half of a 95 % interval in standard deviations (of a shift's parts, of a turn's), with fewer than
+#: six photographs and with more; and what it never falls below: shifts (mm), tip and torque, and
+#: rotation (degrees). Chosen
+#: on generated mouths so that a tooth's shift and its turn are both covered in 95 % of the teeth,
+#: of those that moved alone as well, and so are 95 % of the parts: benchmarks/register.py
+#: --calibrate. Turns have a high floor: what shading does to all photographs alike shows in none
+#: of the jackknives. Of three photographs, rotation is the least sure: crowns are
+#: round about their length, so that their shape does not tell it.
+FACTORS = {"few": (1.7, 1.4), "many": (3.0, 3.0)}
+FLOORS = {"few": (0.15, 4.0, 6.0), "many": (0.08, 3.0, 3.0)}
 MANY = 6
+#: Share of the jackknife over photographs that counts. Of few photographs mostly one or two show a
+#: tooth: without them the estimate falls back to no motion, so that the jackknife says how far the
+#: tooth went rather than how sure that is.
+BY_PHOTOGRAPH = {"few": 0.25, "many": 1.0}
 #: Visits are one patient's if crowns' surroundings correlate by this at least (see `likeness`).
 LEAST_LIKENESS = 0.8
 #: And if so many teeth, and such a share of them, agree with one frame.
@@ -131,7 +137,8 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
             "at check.html of both workspaces: a wrong tooth number is the usual cause."
         )
     factor = "many" if min(len(first.looks), len(second.looks)) >= MANY else "few"
-    teeth = tuple(_teeth(first, there, _mirrored(back, there), factor))
+    mirrored = _mirrored(back, there, BY_PHOTOGRAPH[factor])
+    teeth = tuple(_teeth(first, there, mirrored, back.fits, factor))
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
@@ -144,9 +151,17 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
     )  # fmt: skip
 
 
-def halves(deviation: Array, factor: float, floor: tuple[float, float]) -> Array:
-    """[..., 6] half of the 95 % intervals of parts, by their deviations [..., 6]."""
-    return np.asarray(np.hypot(factor * deviation, np.repeat(floor, 3)))
+def halves(
+    deviation: Array, factors: tuple[float, float], floors: tuple[float, float, float]
+) -> Array:  # fmt: skip
+    """[..., 6] half of the 95 % intervals of parts, by their deviations [..., 6].
+
+    Args:
+        deviation: of each part, mm and degrees.
+        factors: of a shift's parts, and of a turn's.
+        floors: what they never fall below: shifts, tip and torque, rotation; mm and degrees.
+    """
+    return np.asarray(np.hypot(np.repeat(factors, 3) * deviation, np.repeat(floors, (3, 2, 1))))
 
 
 def _frame(first: Visit, second: Visit) -> tuple[Array, list[int]]:
@@ -165,7 +180,9 @@ def _frame(first: Visit, second: Visit) -> tuple[Array, list[int]]:
     return frame, agreeing
 
 
-def _mirrored(back: Estimate, there: Estimate) -> dict[int, tuple[Array, Array]]:
+def _mirrored(
+    back: Estimate, there: Estimate, by_photograph: float
+) -> dict[int, tuple[Array, Array]]:
     """What the way back says of each tooth, as a displacement [6] of the way there, covariance."""
     frame = inverted(back.first_from_second)  # first_from_second of the way there
     inverse = np.linalg.inv(frame)
@@ -173,7 +190,7 @@ def _mirrored(back: Estimate, there: Estimate) -> dict[int, tuple[Array, Array]]
     turn = np.zeros((6, 6))
     turn[:3, :3], turn[3:, 3:] = frame[:3, :3], frame[:3, :3] / scale
     found = {}
-    for number, (displacement, covariance) in measured(back).items():
+    for number, (displacement, covariance) in measured(back, by_photograph).items():
         if number not in there.centres:
             continue
         centre = back.centres[number]
@@ -186,12 +203,17 @@ def _mirrored(back: Estimate, there: Estimate) -> dict[int, tuple[Array, Array]]
 
 
 def _teeth(
-    first: Visit, there: Estimate, back: Mapping[int, tuple[Array, Array]], factor: str
-) -> list[Moved]:
-    """Both ways together: their mean; what they differ by adds to the doubt."""
+    first: Visit, there: Estimate, back: Mapping[int, tuple[Array, Array]],
+    back_fits: Mapping[int, float], factor: str,
+) -> list[Moved]:  # fmt: skip
+    """Both ways together: their mean; what they differ by adds to the doubt.
+
+    So do pictures that do not fit, where photographs are few.
+    """
     axes = tooth_axes(first.centres)
     result = []
-    for number, (forward, covariance) in sorted(measured(there).items()):
+    ways = measured(there, BY_PHOTOGRAPH[factor])
+    for number, (forward, covariance) in sorted(ways.items()):
         displacement = forward
         if number in back:
             other, its = back[number]
@@ -201,6 +223,9 @@ def _teeth(
         leads = to_parts(axes[number])
         parts = leads @ displacement
         deviation = np.sqrt(np.maximum(np.diag(leads @ covariance @ leads.T), 0))
+        if factor == "few":
+            fits = [way[number] for way in (there.fits, back_fits) if number in way]
+            deviation *= misfit(min(fits, default=RANGE[0]))
         interval = halves(deviation, FACTORS[factor], FLOORS[factor])
         mine = [s for s in there.spots if s.tooth == number and len(s.points)]
         turn = float(np.degrees(Rotation.from_rotvec(displacement[3:]).magnitude()))

@@ -61,6 +61,7 @@ class Estimate:
         first_from_second: [4, 4] similarity of the two visits' frames.
         seen: FDI number -> [4, 4] motion of a tooth that moved, by which its pictures fit better
             than by `state` (see `photometric`).
+        fits: FDI number -> correlation of the tooth's pictures by its motion, -1..1.
     """
 
     state: State
@@ -73,6 +74,7 @@ class Estimate:
     residual: float
     first_from_second: Array
     seen: dict[int, Array] = field(default_factory=dict)
+    fits: dict[int, float] = field(default_factory=dict)
 
 
 def estimate(
@@ -102,7 +104,7 @@ def estimate(
             state = _step(spots, state, centres, None, laid)
     # Flow is lost where it starts too far off: such teeth get another start.
     still = stood_still(state, centres, spots)
-    better = searched(a, b, state, still, centres, tooth_axes(centres), PARTNERS, WIDEST)
+    better, _ = searched(a, b, state, still, centres, tooth_axes(centres), PARTNERS, WIDEST)
     started = {n: fit.motion for n, fit in better.items() if n not in still or fit.score >= FITS}
     state = replace(state, motions={**state.motions, **started})
     factor = 1.0
@@ -113,12 +115,12 @@ def estimate(
             state = _step(spots, state, centres, still, laid)
         factor /= noise(spots, state, centres, still)
     blocks = [solving.block_of(s, state, centres[s.tooth]) for s in spots]
-    seen = searched(a, b, state, still, centres, None, PARTNERS, WIDEST)
+    seen, fits = searched(a, b, state, still, centres, None, PARTNERS, WIDEST)
     likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
     return Estimate(
         state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
-        first_from_second, {n: fit.motion for n, fit in seen.items() if n not in still},
+        first_from_second, {n: fit.motion for n, fit in seen.items() if n not in still}, fits,
     )  # fmt: skip
 
 

@@ -211,8 +211,9 @@ def best_motion(views: Sequence[Facing], now: Array, centre: Array, axes: Array)
 def searched(
     first: Sequence[Prepared], second: Sequence[Prepared], state: State, still: Sequence[int],
     centres: Mapping[int, Array], axes: Mapping[int, Array] | None, partners: int, widest: float,
-) -> dict[int, Fit]:  # fmt: skip
-    """FDI number -> a better motion, for teeth whose pictures fit better with one.
+) -> tuple[dict[int, Fit], dict[int, float]]:  # fmt: skip
+    """Better motions, by FDI number, of teeth whose pictures fit better with one; and how well the
+    pictures of every tooth fit (-1..1), with that or as it is.
 
     Args:
         first, second: photographs of both visits.
@@ -225,13 +226,13 @@ def searched(
     """
     a, b = Pictures(first), Pictures(second)
     pairs = pairs_of([p.look.camera for p in first], list(state.cameras), partners, widest)
-    found = {}
+    found, likeness = {}, {}
     for tooth in sorted(state.motions):
         views = facings(tooth, a, b, state, pairs)
         if not views:
             continue
         now = state.motions[tooth]
-        fits = score(views, FINE, now)
+        fits = likeness[tooth] = score(views, FINE, now)
         if tooth in still and (fits >= FITS or axes is None):
             continue
         best = improved(views, now, centres[tooth])
@@ -242,4 +243,5 @@ def searched(
             best = other if other.score > best.score + CLEARLY else best
         if best.score > fits + (CLEARLY if tooth in still else 0.0):
             found[tooth] = best
-    return found
+            likeness[tooth] = best.score
+    return found, likeness

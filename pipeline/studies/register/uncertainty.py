@@ -12,13 +12,31 @@ from pipeline.studies.register.estimate import Estimate, pulls
 
 Array = npt.NDArray[np.float64]
 
+#: A crown's pictures correlate by this, usually, and by no less and no more than these.
+USUAL, RANGE = 0.85, (0.2, 0.98)
 
-def measured(found: Estimate) -> dict[int, tuple[Array, Array]]:
+
+def misfit(likeness: float) -> float:
+    """Factor of a tooth's standard deviations, by how well its pictures agree (-1..1).
+
+    Residuals are what correlation leaves unexplained: their size against what it explains, over
+    the same of a usual crown. A motion by which pictures do not fit is the wrong one, however sure
+    the equations are of it.
+    """
+    r, usual = np.square([np.clip(likeness, *RANGE), USUAL])
+    return float(np.sqrt((1 - r) / r / ((1 - usual) / usual)))
+
+
+def measured(found: Estimate, by_photograph: float = 1.0) -> dict[int, tuple[Array, Array]]:
     """FDI number -> displacement [6] (shift mm, rotation vector rad) and its covariance [6, 6].
 
     A tooth that stood still is let go, all others stay: so its own motion is measured as well. The
     covariance is that of the equations and of two jackknives, over the photographs of the second
     visit and over the teeth that everything is measured against.
+
+    Args:
+        found: the estimate.
+        by_photograph: share of the first of these jackknifes that counts.
     """
     blocks = [b for b in found.blocks if b.weight > 0]
     teeth = sorted({b.tooth for b in blocks})
@@ -53,11 +71,11 @@ def measured(found: Estimate) -> dict[int, tuple[Array, Array]]:
         for n in group:
             at = system.place(n)
             covariance = inverse[at, at].copy()
-            for sample in (by_view, by_tooth):
+            for sample, counts in ((by_view, by_photograph), (by_tooth, 1.0)):
                 if sample:
                     off = np.array([s[n] for s in sample]) - whole[n]
                     # A photograph that does not show the tooth says nothing of it.
-                    covariance += (len(sample) - 1) / len(sample) * off.T @ off
+                    covariance += counts * (len(sample) - 1) / len(sample) * off.T @ off
             best = whole[n]
             if n in found.seen:  # what flow says differs from what the pictures say: doubt
                 best = solving.displacement(found.seen[n], found.centres[n])
