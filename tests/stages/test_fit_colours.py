@@ -8,7 +8,7 @@ import pytest
 from pipeline.artifacts.views import View, Views
 from stages.fit.config import FitConfig, FitSettings, resolve
 from stages.fit.inputs.scene import prepare
-from stages.fit.numerics.colours import solved
+from stages.fit.numerics.colours import bounded, solved
 from stages.fit.parts.colours import Colours, slope_of
 from stages.fit.parts.light import Light
 from stages.fit.stage import FitStage
@@ -43,6 +43,18 @@ def test_the_equations_are_solved_channel_by_channel() -> None:
     found = solved(lambda x: (matrix @ x).astype(np.float32), wanted, 0.1, 40)
     np.testing.assert_allclose(found, np.linalg.solve(matrix + 0.1 * np.eye(12), wanted), atol=1e-4)
     assert not solved(lambda x: x, wanted, 0.1, 0).any()
+
+
+def test_colours_stay_among_those_around() -> None:
+    positions = np.arange(5, dtype=np.float32)[:, None] * np.array([[1, 0, 0]], np.float32)
+    colours = np.array([0.2, 0.3, 0.4, 0.8, 0.9], np.float32)[:, None].repeat(3, 1)
+    move = np.array([-1, 0.05, 1, -0.1, 1], np.float32)[:, None].repeat(3, 1)
+    found = bounded(move, colours, positions, 2, 0.1)[:, 0]
+    # each may go from 0.1 below to 0.1 above itself and its two nearest
+    np.testing.assert_allclose(found, [-0.1, 0.05, 0.5, -0.1, 0.1], atol=1e-6)
+    alone = bounded(move[:1], colours[:1], positions[:1], 2, 0.1)
+    np.testing.assert_allclose(alone, -0.1, atol=1e-6)
+    assert bounded(move[:0], colours[:0], positions[:0], 2, 0.1).shape == (0, 3)
 
 
 def test_nothing_wanted_is_nothing_moved() -> None:

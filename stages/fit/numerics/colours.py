@@ -1,12 +1,14 @@
-"""Conjugate gradients on damped normal equations, for each channel by itself."""
+"""Conjugate gradients on damped normal equations, channel by channel, and a bound for them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from stages.fit.arrays import Array, Floats
+from stages.splatting.threads import workers
 
 #: what no photograph shows has no weight to divide by
 LEAST = 1e-3
@@ -43,6 +45,29 @@ def solved(
         share = (now / np.maximum(before, 1e-30)).astype(np.float32)
         direction = conditioned + share * direction
     return found
+
+
+def bounded(
+    move: Floats, colours: Floats, positions: Floats, neighbours: int, reach: float
+) -> Floats:
+    """[N, 3] `move`, cut where it leads to a colour that nothing around has.
+
+    Args:
+        move: [N, 3] change of the colours [N, 3].
+        positions: [N, 3] of what has them.
+        neighbours: colours may move among those that so many of the nearest have now, ...
+        reach: ... and so far beyond.
+    """
+    count = min(neighbours + 1, len(colours))
+    if count < 1:
+        return move
+    _, nearest = cKDTree(positions).query(positions, k=count, workers=workers())
+    least, most = colours.copy(), colours.copy()
+    for column in nearest.reshape(len(colours), count).T:
+        np.minimum(least, colours[column], out=least)
+        np.maximum(most, colours[column], out=most)
+    margin = np.float32(reach)
+    return np.clip(move, least - margin - colours, most + margin - colours)
 
 
 def _products(a: Floats, b: Floats) -> Array:

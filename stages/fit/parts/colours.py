@@ -26,16 +26,22 @@ if TYPE_CHECKING:
     from stages.splatting.rasterizer import Rendering, Viewpoint
 
 
+#: Nearest Gaussians whose colours say what a colour may be.
+NEIGHBOURS = 8
+
+
 class Colours(Part, switch="colour_steps", on=4, off=0):
     """What is left of the error, as far as colours can mend it."""
 
     class Settings(PartSettings):
         colour_steps: Whole = 4
         """steps of conjugate gradients that solve for the colours at the end; 0: none"""
-        # with .01 renders are a little sharper, but what photographs hardly show gets loud colours
-        # there that no photograph has, and that other viewpoints do show
-        colour_damping: Positive = 0.3
+        colour_damping: Positive = 0.01
         """holds colours where they are: as if this many pixels of each view showed them so"""
+        # damped this little, what photographs hardly show would else get loud colours that no
+        # photograph has, and that other viewpoints do show
+        colour_reach: Positive = 0.1
+        """they stay this near to the range of colours that the eight nearest Gaussians had"""
 
     def end(self, fit: Trainer) -> None:
         from stages.splatting.kernels.features import C0
@@ -60,8 +66,13 @@ class Colours(Part, switch="colour_steps", on=4, off=0):
 
         damping = s.colour_damping * len(looks)
         move = numerics.colours.solved(normal, wanted, damping, s.colour_steps)
+        constant = fit.packed[:, HARMONICS : HARMONICS + 3]
+        colours = constant * C0 if light is None else light.material[:, :3]
+        move = numerics.colours.bounded(
+            move, colours, fit.packed[:, :3], NEIGHBOURS, s.colour_reach
+        )  # fmt: skip
         if light is None:
-            fit.packed[:, HARMONICS : HARMONICS + 3] += move / C0
+            constant += move / C0
         else:
             light.brighten(move)
 
