@@ -23,6 +23,8 @@ VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
 )  # fmt: skip
 MASK_PREFIX = "masks/"
+#: Names of folders with photographs, beside others with depth maps or masks.
+USUAL_FOLDERS = {"images", "photos", "photographs", "frames", "rgb"}
 
 
 @dataclass(frozen=True)
@@ -253,12 +255,14 @@ def _expand_folder(folder: Path) -> list[Path]:
     if videos:
         advice = f"To use the video, name it: {folder / videos[0]}"
     else:
-        for entry in entries:
-            if entry.is_folder and any(
-                is_photograph(inner.path) for inner in _try_list(entry.path)
-            ):
-                advice = f"Did you mean the folder in it: {entry.path}"
-                break
+        inside = [
+            entry.path
+            for entry in entries
+            if entry.is_folder and any(is_photograph(e.path) for e in _try_list(entry.path))
+        ]
+        if inside:
+            likely = min(inside, key=lambda path: path.name.lower() not in USUAL_FOLDERS)
+            advice = f"Did you mean the folder in it: {likely}"
     raise RequestError(f"There is no photograph in {folder} ({_describe(entries)}). {advice}")
 
 

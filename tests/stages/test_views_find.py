@@ -157,6 +157,11 @@ def test_folders_without_photographs(tmp_path: Path) -> None:
     assert str(tmp_path / "film" / "x.mp4") in refused([tmp_path / "film"])
 
 
+def test_the_folder_that_was_meant_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "depth/0.png", "frames/0.png", "masks/0.png")
+    assert refused([tmp_path]).endswith(str(tmp_path / "frames"))
+
+
 def test_a_video_is_alone(tmp_path: Path) -> None:
     video, other, image = touch(tmp_path, "x.MP4", "y.mov", "a.png")
     assert find_images([video]) == {"x.MP4": video}
