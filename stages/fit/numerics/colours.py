@@ -70,6 +70,15 @@ def bounded(
     return np.clip(move, least - margin - colours, most + margin - colours)
 
 
+def deviation(sizes: list[Floats]) -> float:
+    """Standard deviation of what is noise in the differences of these sizes.
+
+    By their median, as few pixels lie at edges that a render has in another place.
+    """
+    every = np.concatenate(sizes)
+    return 1.4826 * float(np.median(every)) if len(every) else 0.0
+
+
 def _products(a: Floats, b: Floats) -> Array:
     """[3] scalar products, channel by channel."""
     return np.asarray(np.einsum("nc,nc->c", a, b, dtype=np.float64))
