@@ -72,9 +72,9 @@ class Basics(PartSettings):
     """weight of 1 - SSIM against L1 in the colour loss"""
     # between many views positions are held by all: with twice the rates that few views bear,
     # 560 steps at 12 views come to what 700 came to
-    position_lr_init: AutoFloat = automatic({3: 3.2e-4, 6: 6e-4}, gt=0, ge=None)
+    position_lr_init: AutoFloat = automatic({3: 3.2e-4, 6: 6e-4}, held=3.2e-4, gt=0, ge=None)
     """learning rate of positions at the start, relative to the scene's extent (3DGS: 1.6e-4)"""
-    position_lr_final: AutoFloat = automatic({3: 1.6e-5, 6: 6e-5}, gt=0, ge=None)
+    position_lr_final: AutoFloat = automatic({3: 1.6e-5, 6: 6e-5}, held=1.6e-5, gt=0, ge=None)
     """learning rate of positions at the end (3DGS: 1.6e-6)"""
     feature_lr: AutoFloat = automatic({3: 5e-3, 6: 0.015}, held=0.04)
     """learning rate of the constant colour (3DGS: 0.0025)"""

@@ -118,6 +118,8 @@ def test_what_auto_comes_to_follows_the_number_of_views_without_steps() -> None:
     assert rates == sorted(rates) and rates[3] == 7.5e-4 and rates[-2:] == [2e-3, 2e-3]
     assert [at(n).sh_degree for n in (6, 7, 8, 9)] == [1, 1, 2, 2]
     assert [at(n).densify for n in (3, 4, 5, 6)] == [False, False, False, True]
+    assert [at(n).position_lr_init for n in (3, 6, 12)] == [3.2e-4, 6e-4, 6e-4]
+    assert resolve(FitConfig(), 12, 0, held=True).position_lr_init == 3.2e-4
 
 
 def test_rates_of_positions_follow_a_schedule_of_30000_iterations() -> None:
