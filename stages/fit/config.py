@@ -51,7 +51,7 @@ class Basics(PartSettings):
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
     bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
     same images and gradients in a first trial)"""
-    iterations: AutoInt = automatic({3: 400, 6: 450, 12: 560, 24: 700}, held=160, ge=1)
+    iterations: AutoInt = automatic({3: 400, 6: 500, 12: 600, 24: 700}, held=160, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
     # larger views of what isn't held don't need more: with twice as many at 1024 px, unseen views
@@ -71,7 +71,7 @@ class Basics(PartSettings):
     lambda_dssim: Share = 0.2
     """weight of 1 - SSIM against L1 in the colour loss"""
     # between many views positions are held by all: with twice the rates that few views bear,
-    # 560 steps at 12 views come to what 700 came to
+    # 600 steps at 12 views come to more than 700 came to
     position_lr_init: AutoFloat = automatic({3: 3.2e-4, 6: 6e-4}, held=3.2e-4, gt=0, ge=None)
     """learning rate of positions at the start, relative to the scene's extent (3DGS: 1.6e-4)"""
     position_lr_final: AutoFloat = automatic({3: 1.6e-5, 6: 6e-5}, held=1.6e-5, gt=0, ge=None)
