@@ -13,6 +13,7 @@ from stages.fit.parts.camera import Background, Exposure, Focal, Poses
 from stages.fit.parts.colours import Colours
 from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
 from stages.fit.parts.detail import Detail
+from stages.fit.parts.extension import MORE, Extension
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
 from stages.fit.parts.progressive import Progressive
@@ -34,13 +35,14 @@ from stages.fit.settings import (
 
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
-    Progressive, Filling, Shading, Saturation, Coarse, Detail, Exposure, Background, Depth, Flow,
-    Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters, Colours,
+    Progressive, Filling, Shading, Saturation, Coarse, Extension, Detail, Exposure, Background,
+    Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal, Density, Floaters,
+    Colours,
 )  # fmt: skip
 PartName = Literal[
-    "background", "coarse", "colours", "density", "depth", "detail", "exposure", "filling",
-    "floaters", "flow", "focal", "isotropic", "light", "mcmc", "poses", "progressive", "saturation",
-    "shading", "surface", "variation", "warp",
+    "background", "coarse", "colours", "density", "depth", "detail", "exposure", "extension",
+    "filling", "floaters", "flow", "focal", "isotropic", "light", "mcmc", "poses", "progressive",
+    "saturation", "shading", "surface", "variation", "warp",
 ]  # fmt: skip
 
 
@@ -97,9 +99,9 @@ class Basics(PartSettings):
 class FitConfig(
     Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings,
     Density.Settings, Detail.Settings, Warp.Settings, Surface.Settings, Isotropic.Settings,
-    Focal.Settings, Progressive.Settings, Poses.Settings, Coarse.Settings, Variation.Settings,
-    Depth.Settings, Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings,
-    Filling.Settings, Basics,
+    Focal.Settings, Progressive.Settings, Poses.Settings, Extension.Settings, Coarse.Settings,
+    Variation.Settings, Depth.Settings, Flow.Settings, Light.Settings, Saturation.Settings,
+    Shading.Settings, Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 
@@ -168,6 +170,7 @@ def resolve(
         pixels: of a view.
     """
     values = dict(config)
+    free = values["iterations"] == AUTO
     if values["hold_surface"] == AUTO:
         values["hold_surface"] = bool(held)
     for name, field in FitConfig.model_fields.items():
@@ -177,6 +180,8 @@ def resolve(
             value = rule["held"] if flat else by_rule(rule["views"], views)
             grows = flat and rule["grows"]
             values[name] = round(value * sqrt(pixels / PIXELS)) if grows else value
+    if values["extension"] == AUTO:
+        values["extension"] = MORE if free and not values["hold_surface"] else 0.0
     if values["densify_until_iter"] == AUTO:
         values["densify_until_iter"] = max(0, values["iterations"] - SETTLE)
     return FitSettings.model_construct(**values, seed=seed)

@@ -48,7 +48,7 @@ def fit(
     *,
     threads: int,
     checkpoint: Path | None,
-    report: Callable[[int, float, float, int], None],
+    report: Callable[[int, int, float, float, int], None],
     diary: Path | None = None,
 ) -> FitResult:
     """Fit Gaussians and poses.
@@ -60,7 +60,7 @@ def fit(
         settings: all constants.
         threads: never changes the result.
         checkpoint: file to save the state to and to start from, or None.
-        report: called with iteration, loss, PSNR and number of Gaussians.
+        report: called with iteration, of how many, loss, PSNR and number of Gaussians.
         diary: folder for the loss curve and previews, or None.
 
     Raises:
@@ -92,7 +92,7 @@ def fit(
     ]  # fmt: skip
     summary: dict[str, float | int | str] = {
         "gaussians": len(gaussians),
-        "iterations": settings.iterations,
+        "iterations": trainer.iterations,
         "backend": "cpu" if trainer.rasterize is rasterize else "gsplat",
         "parts": ", ".join(part.name for part in trainer.parts),
         "light": light,

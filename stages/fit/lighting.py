@@ -66,7 +66,7 @@ def _by_trial(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, float
     trial = settings.but(
         iterations=settings.light_trial_iterations,
         initial_points=settings.light_trial_points,
-        coarse_fraction=0.0, detail=False,
+        coarse_fraction=0.0, detail=False, extension=0.0,
         lambda_flow=0.0, optimize_poses=False, densify=False, exposure=False, warp_levels=0,
         opacity_reset_interval=0, sh_degree_interval=0,
     )  # fmt: skip

@@ -19,7 +19,7 @@ class FitStage(Stage):
     """views + cameras + points (+ flow) -> gaussians + refined cameras."""
 
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 13
+    version: ClassVar[int] = 14
     summary: ClassVar[str] = "optimise Gaussians and camera poses against the photographs"
     Config: ClassVar[type[StageConfig]] = FitConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras", "points")
@@ -75,9 +75,9 @@ class FitStage(Stage):
         pixels = max(view.image.shape[0] * view.image.shape[1] for view in placed)
         settings = resolve(context.config, len(placed), context.seed, held, pixels)
 
-        def report(iteration: int, loss: float, psnr: float, gaussians: int) -> None:
+        def report(done: int, of: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}
-            context.progress("fit", iteration, settings.iterations, **figures)
+            context.progress("fit", done, of, **figures)
 
         diary = context.scratch / "diary"
         diary.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,8 @@ class Trainer:
         poses: the cameras' optimiser, which holds the poses; focal: that of their focal length.
         rasterize: what steps are taken with (see `backend`).
         views: those that take part; queue: those whose turn it still is.
-        iteration: steps taken.
+        iteration: steps taken, of `iterations`, which `Extension` may raise.
+        haste: factor of the rates of positions and colours, from `Extension`.
         psnr, loss: running means over recent iterations.
     """
 
@@ -51,7 +52,8 @@ class Trainer:
     kept = (
         "packed", "adam.first", "adam.second", "adam.steps", "poses.poses", "poses.first",
         "poses.second", "poses.steps", "focal.log_factor", "focal.first", "focal.second",
-        "focal.steps", "iteration", "loss", "psnr", "best_loss", "resized", "curve",
+        "focal.steps", "iteration", "iterations", "haste", "loss", "psnr", "best_loss", "resized",
+        "curve",
     )  # fmt: skip
 
     def __init__(
@@ -87,7 +89,7 @@ class Trainer:
         self.random = np.random.Generator(np.random.PCG64(self.settings.seed))
         self.views = list(range(len(self.targets)))
         self.queue: list[int] = []
-        self.iteration = 0
+        self.iteration, self.iterations, self.haste = 0, settings.iterations, 1.0
         self.loss = self.psnr = 0.0
         self.best_loss = np.inf
         self.resized = 0
@@ -134,11 +136,14 @@ class Trainer:
         view = self.queue.pop()
         self.iteration += 1
         self._use_harmonics()
-        s = self.settings
-        factor = reduction(s, self.iteration)
+        factor = self.reduction(self.iteration)
         target = self.targets[view][factor]
-        done = self.iteration / s.iterations
+        done = self.iteration / self.iterations
         return Step(view, factor, target, self.viewpoint(view, target), done)
+
+    def reduction(self, iteration: int) -> int:
+        """By which factor images are reduced in an iteration."""
+        return reduction(self.settings, iteration, self.iterations)
 
     def _compare(self, step: Step) -> None:
         """Loss, PSNR, and the gradients of a rendered view."""
@@ -159,13 +164,15 @@ class Trainer:
         """[D] learning rate of each column now."""
         s = self.settings
         rates = np.empty(self.packed.shape[1], np.float32)
-        done = self.iteration / s.iterations
+        done = self.iteration / self.iterations
         rates[0:3] = self.extent * interpolate(s.position_lr_init, s.position_lr_final, done)
         rates[3:7] = s.rotation_lr
         rates[7:10] = s.scaling_lr
         rates[10] = s.opacity_lr
         rates[11:14] = s.feature_lr
         rates[14:] = s.feature_rest_lr
+        rates[0:3] *= self.haste
+        rates[11:] *= self.haste
         return rates
 
     def degree(self) -> int:
@@ -238,7 +245,7 @@ class Trainer:
 
     def diverged(self, what: str) -> ReconstructionError:
         return ReconstructionError(
-            f"The fit diverged at iteration {self.iteration} of {self.settings.iterations}: "
+            f"The fit diverged at iteration {self.iteration} of {self.iterations}: "
             f"{what}. Lower the learning rates (fit.feature_lr, fit.scaling_lr, "
             "fit.pose_lr_init), or look at the cameras and the points that it started from "
             "('pipeline status'). The last good state is kept as a checkpoint."
@@ -247,14 +254,14 @@ class Trainer:
     def run(
         self,
         checkpoint: Path | None,
-        report: Callable[[int, float, float, int], None],
+        report: Callable[[int, int, float, float, int], None],
         diary: Path | None = None,
     ) -> None:
         """Step until the last iteration, from the checkpoint if there is a usable one.
 
         Args:
             checkpoint: file to save to and start from, or None.
-            report: called with iteration, loss, PSNR and number of Gaussians.
+            report: called with iteration, of how many, loss, PSNR and number of Gaussians.
             diary: folder for the loss curve and previews, or None.
 
         Raises:
@@ -263,14 +270,14 @@ class Trainer:
         if checkpoint is not None:
             self.restore(checkpoint)
         s = self.settings
-        while self.iteration < s.iterations:
+        while self.iteration < self.iterations:
             self.step()
-            now, last = self.iteration, self.iteration == s.iterations
+            now, last = self.iteration, self.iteration == self.iterations
             if now % REPORT_EVERY == 0 or last:
                 self._check()
-                figures = (now, self.loss, self.psnr, len(self.packed))
-                self.curve = np.concatenate([self.curve, [figures]])
-                report(*figures)
+                figures = (self.loss, self.psnr, len(self.packed))
+                self.curve = np.concatenate([self.curve, [(now, *figures)]])
+                report(now, self.iterations, *figures)
             if diary is not None and s.preview_every > 0 and (now % s.preview_every == 0 or last):
                 write_curve(diary, self.curve.tolist())
                 view = self.poses.held
@@ -286,8 +293,8 @@ class Trainer:
         """Raises where the loss has grown beyond what any good moment explains."""
         s = self.settings
         # what explains small images perfectly starts anew at a larger size
-        factor = reduction(s, self.iteration)
-        if factor != reduction(s, max(1, self.iteration - REPORT_EVERY)):
+        factor = self.reduction(self.iteration)
+        if factor != self.reduction(max(1, self.iteration - REPORT_EVERY)):
             self.resized = self.iteration
         started = max(self.resized, *(part.latest for part in self.parts))
         if self.iteration - started < SETTLED:

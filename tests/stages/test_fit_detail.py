@@ -22,7 +22,7 @@ def packed(count: int) -> np.ndarray:
 def test_images_grow_by_halves_and_end_at_full_size() -> None:
     settings = resolve(FitConfig(iterations=100, coarse_fraction=0.6, coarse_factor=4), 3, 0, None)
     assert coarse_factors(settings) == [4, 2]
-    factors = [reduction(settings, k) for k in range(1, 101)]
+    factors = [reduction(settings, k, 100) for k in range(1, 101)]
     assert factors == [4] * 30 + [2] * 30 + [1] * 40
 
 
@@ -30,7 +30,7 @@ def test_images_grow_by_halves_and_end_at_full_size() -> None:
 def test_no_small_images_where_none_are_wanted(changes: dict) -> None:
     settings = resolve(FitConfig(**changes), 3, 0, None)
     assert not coarse_factors(settings)
-    assert reduction(settings, 1) == 1
+    assert reduction(settings, 1, 100) == 1
 
 
 def test_a_gaussian_is_split_along_the_axes_asked_for() -> None:

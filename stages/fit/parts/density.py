@@ -53,7 +53,7 @@ class Density(
         densify_from_iter: Whole = 150
         """first iteration of densification"""
         densify_until_iter: AutoInt = automatic(f"{SETTLE} before the end")
-        """last iteration of densification"""
+        """last iteration of densification (before an extension)"""
         densification_interval: Count = 50
         """iterations between densifications"""
         densify_grad_threshold: Positive = 2e-4
@@ -78,10 +78,10 @@ class Density(
         wanted = "mcmc" if cls.name == "mcmc" else "default"
         return super().of(fit) if fit.settings.strategy == wanted else None
 
-    def due(self, now: int) -> bool:
-        s = self.settings
-        within = s.densify_from_iter <= now <= s.densify_until_iter
-        return within and now % s.densification_interval == 0
+    def due(self, fit: Trainer) -> bool:
+        s, now = self.settings, fit.iteration
+        until = s.densify_until_iter + fit.iterations - s.iterations
+        return s.densify_from_iter <= now <= until and now % s.densification_interval == 0
 
     def populate(self, fit: Trainer, step: Step) -> None:
         s = self.settings
@@ -89,7 +89,7 @@ class Density(
             step.gradients.centres, step.gradients.absolute, step.rendering.visible,
             step.target.width, step.target.height,
         )  # fmt: skip
-        if self.due(fit.iteration):
+        if self.due(fit):
             largest = np.exp(fit.packed[:, 7:10]).max(1)
             clone, split = numerics.density.choose(
                 self.statistics, largest, small=s.percent_dense * fit.extent, absgrad=s.absgrad,
@@ -130,7 +130,7 @@ class Mcmc(
 
     def populate(self, fit: Trainer, step: Step) -> None:
         s = self.settings
-        if self.due(fit.iteration):
+        if self.due(fit):
             fit.replace(
                 *numerics.density.relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random)
             )

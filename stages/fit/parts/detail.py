@@ -15,7 +15,6 @@ from pydantic import Field
 from stages.fit import numerics
 from stages.fit.arrays import Array, Floats
 from stages.fit.parts.base import Figures, Part
-from stages.fit.parts.start import reduction
 from stages.fit.parts.surface import Surface
 from stages.fit.settings import AutoFloat, PartSettings, Positive, automatic
 from stages.photographs.noise import noise_level
@@ -51,7 +50,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         self.added = 0
 
     def begin(self, fit: Trainer) -> None:
-        now, after = (reduction(fit.settings, fit.iteration + k) for k in (0, 1))
+        now, after = (fit.reduction(fit.iteration + k) for k in (0, 1))
         if fit.iteration and after < now:
             self._split(fit, after)
 

@@ -47,13 +47,13 @@ class Saturation(Part, absent={"saturation": 2.0}):  # above any colour
         """photographs are white from here on: a rendering may be brighter there without penalty"""
 
 
-def reduction(settings: FitSettings, iteration: int) -> int:
-    """By which factor images are reduced in an iteration, counted from 1.
+def reduction(settings: FitSettings, iteration: int, iterations: int) -> int:
+    """By which factor images are reduced in an iteration, counted from 1, of so many.
 
     From ``coarse_factor`` it is halved until it is 1; what is reduced at all takes equal shares.
     """
     factors = coarse_factors(settings)
-    coarse = settings.coarse_fraction * settings.iterations
+    coarse = settings.coarse_fraction * iterations
     if not factors or iteration > coarse:
         return 1
     return factors[min(int((iteration - 1) * len(factors) / coarse), len(factors) - 1)]
