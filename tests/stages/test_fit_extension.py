@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeline.artifacts.points import Points
+from pipeline.artifacts.views import Views
 from stages.fit.config import FitConfig, resolve
 from stages.fit.parts.extension import MORE
 from stages.fit.stage import FitStage
@@ -16,16 +16,11 @@ from tests.stages.fit_case import StoppedError, case, context, outputs
 ALWAYS = {"extension": 0.5, "extension_psnr": (60.0, 70.0)}
 
 
-def elsewhere(points: Points) -> Points:
-    """Points that are not where their colours belong, as where stereo saw nothing."""
-    order = np.random.default_rng(0).permutation(len(points))
-    return dataclasses.replace(points, colors=points.colors[order])
-
-
 def test_what_is_far_from_right_gets_more_steps_and_what_is_right_none(tmp_path) -> None:
     views, cameras, points = case()
+    half = points[points.positions[:, 0] < 0]  # as where stereo saw nothing
     steps = []
-    for name, cloud in (("right", points), ("wrong", elsewhere(points))):
+    for name, cloud in (("right", points), ("half", half)):
         here = context(tmp_path / name, views, cameras, cloud, iterations=60, extension=0.5)
         seen: list[tuple[int, int]] = []
         here.on_progress = lambda _, done, of, seen=seen, **figures: seen.append((done, of))
@@ -35,6 +30,24 @@ def test_what_is_far_from_right_gets_more_steps_and_what_is_right_none(tmp_path)
     assert steps[0] == (60, 0)
     longer, share = steps[1]
     assert share > 0 and longer == pytest.approx(60 * (1 + 0.5 * share), abs=1)
+
+
+def test_noise_and_exposure_are_no_reason_for_more_steps(tmp_path) -> None:
+    views, cameras, points = case()
+    rng = np.random.default_rng(5)
+    worse = tuple(
+        dataclasses.replace(
+            view,
+            image=np.clip(
+                view.image * gain + rng.normal(0, 0.1, view.image.shape), 0, 1
+            ).astype(np.float32),
+        )
+        for view, gain in zip(views.views, (0.75, 1.0, 0.85), strict=True)
+    )  # fmt: skip
+    here = context(tmp_path, Views(worse), cameras, points, iterations=60, extension=0.5)
+    FitStage().run(here)
+    assert here.figures["train_psnr"] < 20.5  # as it is, it would have had the whole extension
+    assert here.figures["extension"] == 0
 
 
 def test_an_extended_fit_resumes_to_the_same_bytes(tmp_path) -> None:
