@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -120,6 +121,47 @@ def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(
     # Every number was read once and every scene exported once; a fit that was killed ran again.
     assert len(lines(tmp_path, "views")) == 3 == len(lines(tmp_path, "export"))
     assert 4 <= len(lines(tmp_path, "fit")) <= 5
+
+
+class LosingClient:
+    """A Dask client whose worker dies with the first result, just when that is there."""
+
+    status = "running"
+
+    def __init__(self) -> None:
+        self.given: list[str] = []
+
+    def nthreads(self) -> dict[str, int]:
+        return {"worker": 1}
+
+    def submit(self, work: object, job: dict[str, Any], *, key: str, **_: object) -> Any:
+        from pipeline.studies.batch.records import Case, new_record
+
+        assert key not in self.given
+        self.given.append(key)
+        case = Case.from_dict(job["case"])
+        record = new_record(case, "done", settings=job["settings"], session=job["session"])
+        status = "lost" if len(self.given) == 1 else "finished"
+        future = SimpleNamespace(key=key, status=status, result=lambda: record)
+        future.add_done_callback = lambda call: call(future)
+        return future
+
+
+def test_a_result_that_went_with_its_worker_is_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipeline.studies.batch import running
+
+    for name in ("a", "b"):
+        (tmp_path / "cases" / name).mkdir(parents=True)
+        for number in "12":
+            (tmp_path / "cases" / name / f"{number}.jpg").write_text(name + number)
+    client = LosingClient()
+    monkeypatch.setattr(running, "connected", lambda *_: contextlib.nullcontext(client))
+    monkeypatch.setattr(running, "check_workers", lambda *_: None)
+    results = running.batch(tmp_path / "cases", out=tmp_path / "out", scheduler="tcp://nobody:1")
+    assert results["counts"] == {"done": 2}
+    assert [key.rsplit("-", 2)[0] for key in client.given] == ["a", "a", "b"]
 
 
 def test_a_worker_that_does_not_see_the_folder_is_told_of(tmp_path: Path) -> None:

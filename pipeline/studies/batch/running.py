@@ -136,6 +136,7 @@ class _Work:
         #: is cancelled.
         self._cases: dict[str, Case] = {}
         self._futures: dict[str, Any] = {}
+        self._given = 0
 
     def records(self) -> list[dict[str, Any]]:
         """All cases in their order."""
@@ -176,8 +177,14 @@ class _Work:
                     case = self._cases.pop(future.key)
                     del self._futures[future.key]
                     self._listen(case)
-                    self._ended(case, future, total)
+                    if future.status == "lost":
+                        # its worker died with it, just when it had ended: its record still tells
+                        waiting.appendleft(case)
+                    else:
+                        self._ended(case, future, total)
                     continue  # all that have ended come first
+                if client.status == "closed" and not self._futures:
+                    raise _gone()
                 self._look()
                 counts = Counter(record["state"] for record in self._records.values())
                 self._progress.state(counts, total - len(self._left), total)
@@ -208,19 +215,17 @@ class _Work:
                 **self._common, "case": case.to_dict(), "settings": self._plan.settings[case.id],
                 "again": case.id in self._plan.retried,
             }  # fmt: skip
-            future = client.submit(
-                run_case, job, key=f"{case.id}-{self._common['session']}", pure=False, retries=0
-            )
+            # a case that is given out again is another task: the first may still be on its way
+            self._given += 1
+            key = f"{case.id}-{self._common['session']}-{self._given}"
+            future = client.submit(run_case, job, key=key, pure=False, retries=0)
             self._cases[future.key], self._futures[future.key] = case, future
             future.add_done_callback(ended.put)
 
     def _ended(self, case: Case, future: Any, total: int) -> None:
         """Take what came of a case."""
-        if future.status in ("cancelled", "lost"):
-            raise RequestError(
-                "The Dask scheduler is gone, or has cancelled the batch. Nothing that was computed "
-                "is lost: start it again and run the same command again."
-            )
+        if future.status == "cancelled":
+            raise _gone()
         if future.status == "error":
             record = self._broken(case, future.exception())
         else:
@@ -289,6 +294,13 @@ class _Work:
         except (OSError, RequestError) as error:  # a full disk: the cases say so as well
             self._progress.message(f"The summary could not be written: {error}")
         self._written = time.monotonic()
+
+
+def _gone() -> RequestError:
+    return RequestError(
+        "The Dask scheduler is gone, or has cancelled the batch. Nothing that was computed is "
+        "lost: start it again and run the same command again."
+    )
 
 
 def _size(path: Path) -> int:
