@@ -8,11 +8,14 @@ import os
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 
 from tests.studies import toy_batch
@@ -162,6 +165,20 @@ def test_a_result_that_went_with_its_worker_is_asked_for_again(
     results = running.batch(tmp_path / "cases", out=tmp_path / "out", scheduler="tcp://nobody:1")
     assert results["counts"] == {"done": 2}
     assert [key.rsplit("-", 2)[0] for key in client.given] == ["a", "a", "b"]
+
+
+def test_a_batch_on_this_machine_can_be_asked_by_no_other() -> None:
+    from pipeline.studies.batch.cluster import connected
+
+    here = psutil.Process()
+    before = {place for place in here.net_connections() if place.status == "LISTEN"}
+    with connected(None, 2) as client:
+        assert client.submit(sum, (1, 2)).result() == 3
+        now = {place for place in here.net_connections() if place.status == "LISTEN"}
+        for place in now - before:
+            assert place.laddr.ip == "127.0.0.1"
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(f"http://127.0.0.1:{place.laddr.port}/health", timeout=9)
 
 
 def test_a_worker_that_does_not_see_the_folder_is_told_of(tmp_path: Path) -> None:

@@ -15,6 +15,8 @@ from pipeline.studies.batch.task import look
 
 #: Seconds to find a scheduler in.
 PATIENCE = 15
+#: Where only this machine listens, at a port that is free.
+NOWHERE = "127.0.0.1:0"
 
 
 def require_dask() -> None:
@@ -30,8 +32,9 @@ def require_dask() -> None:
 def connected(scheduler: str | None, jobs: int) -> Iterator[Any]:
     """A Dask client.
 
-    Here, all is one process with `jobs` threads, and no port is opened: what needs to be apart is
-    the cases, and each has a process of its own.
+    Here, all is one process with `jobs` threads: what needs to be apart is the cases, and each has
+    a process of its own. No other machine can ask it anything: Dask's web servers, which can't be
+    left out, have no pages, and this machine alone reaches them.
 
     Args:
         scheduler: address (``tcp://host:8786``) or file of a scheduler; None: this machine.
@@ -45,12 +48,17 @@ def connected(scheduler: str | None, jobs: int) -> Iterator[Any]:
     for name in ("distributed", "distributed.core", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is said by the batch
     if scheduler is None:
-        settings = {"distributed.admin.system-monitor.gil.enabled": False}
+        settings = {
+            "distributed.admin.system-monitor.gil.enabled": False,
+            "distributed.scheduler.http.routes": [],
+            "distributed.worker.http.routes": [],
+        }
         with (
             dask.config.set(settings),
             LocalCluster(
-                n_workers=1, threads_per_worker=jobs, processes=False, dashboard_address=None,
-                memory_limit=0, silence_logs=logging.CRITICAL,
+                n_workers=1, threads_per_worker=jobs, processes=False, memory_limit=0,
+                dashboard_address=None, scheduler_kwargs={"dashboard_address": NOWHERE},
+                worker_dashboard_address=NOWHERE, silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
