@@ -144,11 +144,15 @@ def with_kills(cases: Path, out: Path, kills: int, total: int) -> dict[str, Any]
                     rng.choice(workers).kill()
                     killed += 1
                     due.pop(0)
-        results = json.loads(printed(out).read_text())
+        results = json.loads(printed(out).read_text() or "{}")
     finally:
         for each in (process, *nannies, scheduler):
             each.terminate()
             each.wait()
+    if "counts" not in results:
+        sys.exit(
+            f"The batch stopped on its way: {results.get('error', 'see ' + str(out) + '.log')}"
+        )
     quarter = max(1, len(memory) // 4)
     return {
         "counts": results["counts"],
