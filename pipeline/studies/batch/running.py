@@ -136,6 +136,7 @@ class _Work:
         #: is cancelled.
         self._cases: dict[str, Case] = {}
         self._futures: dict[str, Any] = {}
+        #: How many tasks there have been; each has a key of its own.
         self._given = 0
 
     def records(self) -> list[dict[str, Any]]:
@@ -215,7 +216,7 @@ class _Work:
                 **self._common, "case": case.to_dict(), "settings": self._plan.settings[case.id],
                 "again": case.id in self._plan.retried,
             }  # fmt: skip
-            # a case that is given out again is another task: the first may still be on its way
+            # a lost case is another task: the scheduler may still be making the first one anew
             self._given += 1
             key = f"{case.id}-{self._common['session']}-{self._given}"
             future = client.submit(run_case, job, key=key, pure=False, retries=0)

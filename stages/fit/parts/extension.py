@@ -24,7 +24,7 @@ DECIDED = 0.35
 #: squared error below which a photograph counts as explained: 60 dB
 LEAST_ERROR = 1e-6
 #: by which share more steps are taken where all is wrong: with rates twice as high, 1,166 steps in
-#: place of 583 give 11 photographs of a castle 2.4 dB, .4 where a view is unseen
+#: place of 583 give 11 photographs of a castle 2.4 dB, and .2 where a view is unseen
 MORE = 1.0
 
 
