@@ -32,7 +32,7 @@ def _nothing(library: Any) -> None:
 #: Library -> what is done with it as soon as it is there. Those with nothing start threads, which
 #: are not to hear of signals: the system gives one to any thread that does.
 MEDDLERS: dict[str, Callable[[Any], None]] = {
-    "pycolmap": _log_to_stderr, "numpy": _nothing, "scipy.linalg": _nothing,
+    "pycolmap": _log_to_stderr, "numpy": _nothing, "scipy.linalg": _nothing, "cv2": _nothing,
 }  # fmt: skip
 
 
@@ -80,7 +80,8 @@ class _Watched(Loader):
         self._name = name
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        return self._inner.create_module(spec)
+        with signals_held(), handlers_kept():  # where an extension's own libraries are loaded
+            return self._inner.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
         os.environ.setdefault("GLOG_logtostderr", "1")  # read when the library is loaded

@@ -129,6 +129,30 @@ time.sleep(20)
         interrupted(*ended(process))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_no_thread_of_a_native_library_hears_a_signal() -> None:
+    """One that does may hear it while pycolmap's handler is there, whatever the main thread does."""
+    body = """
+import signal
+import numpy, scipy.linalg, scipy.optimize, cv2, pycolmap, numba, av, open3d, pymeshlab, torch
+threads = [int(name) for name in os.listdir('/proc/self/task')]
+for thread in threads:
+    status = open(f'/proc/self/task/{thread}/status').read()
+    held = int(status.split('SigBlk:')[1].split()[0], 16)
+    hears = [n for n in signals.ENDING if not held >> (n - 1) & 1]
+    if bool(hears) != (thread == os.getpid()):
+        print('hears' if hears else 'is deaf', flush=True)
+print(len(threads), 'threads', flush=True)
+"""
+    with started(script(body), ROOT) as process:
+        wait_for(process)
+        told, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "hears" not in told and "is deaf" not in told
+    if len(os.sched_getaffinity(0)) > 1:
+        assert int(told.split()[0]) >= 3  # OpenBLAS has come with its own
+
+
 def test_many_signals_are_one() -> None:
     """Also while what the first one interrupted is being put in order."""
     body = """
