@@ -131,7 +131,7 @@ time.sleep(20)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_no_thread_of_a_native_library_hears_a_signal() -> None:
-    """One that does may hear it while pycolmap's handler is there, whatever the main thread does."""
+    """One that does may hear it while the handler of pycolmap is there."""
     body = """
 import signal
 import numpy, scipy.linalg, scipy.optimize, cv2, pycolmap, numba, av, open3d, pymeshlab, torch
