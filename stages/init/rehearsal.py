@@ -31,7 +31,7 @@ def teeth() -> None:
     photos = [
         Photo(
             k, camera, (HEIGHT, WIDTH), 1.0, image, plain, plain, plain, plain, plain, plain,
-            plain, used,
+            plain, plain, used,
         )
         for k in range(VIEWS)
     ]  # fmt: skip

@@ -32,7 +32,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 14
+    version = 15
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -24,7 +24,7 @@ def photo(yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0) ->
         image=np.zeros((*size, 3), np.float32),
         texture=rng.normal(size=size).astype(np.float32),
         upper=plain, lower=plain, upper_gum=plain, lower_gum=plain, dull=plain + 1,
-        void=plain,
+        void=plain, covered=plain,
         valid=np.ones(size, bool),
     )  # fmt: skip
 

@@ -73,8 +73,9 @@ def show(photo: Photo, jaw: Jaw, points: Array32, seen: Mask, facing: Array32) -
         facing: [H, W] float32 cosine between normal and line of sight.
     """
     pixels, _ = photo.project(points)
+    usable = photo.valid & (photo.covered == 0)
     return Showing(
-        seen=seen & (photo.sample(photo.valid.astype(np.float32), pixels) > 0.5),
+        seen=seen & (photo.sample(usable.astype(np.float32), pixels) > 0.5),
         facing=facing,
         tooth=photo.sample(photo.tooth_of(jaw), pixels),
         gum=photo.sample(photo.gum_of(jaw), pixels),

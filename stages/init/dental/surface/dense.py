@@ -29,6 +29,7 @@ from stages.init.dental.surface.chart.jaws import (
 )
 from stages.init.dental.surface.chart.raster import raster_chart
 from stages.init.dental.surface.cloud import coloured_cloud
+from stages.init.dental.surface.cover import uncovered
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
@@ -152,6 +153,7 @@ def _dense_surface(
     if pairs and options.rounds and options.gum_height > options.grow_from:
         grow_gum(charts, photos, pairs, options, threads)
         _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
+    photos = uncovered(charts, photos, options, threads)
     progress("colour", steps - 1, steps)
     for chart in charts:
         sigma = _AGREEMENT_SMOOTHING * chart.grid.density

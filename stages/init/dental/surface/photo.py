@@ -60,6 +60,7 @@ class Photo:
         upper_gum, lower_gum: [H, W] float32 0 or 1: gum of this jaw.
         dull: [H, W] float32: 1, and 0 in highlights.
         void: [H, W] float32 0 or 1: so dark that nothing can be there, near or far.
+        covered: [H, W] float32 0 or 1: something stands before the teeth and the gum.
         valid: [H, W] bool.
     """
 
@@ -75,6 +76,7 @@ class Photo:
     lower_gum: Array32
     dull: Array32
     void: Array32
+    covered: Array32
     valid: Mask
 
     def tooth_of(self, jaw: Jaw) -> Array32:
@@ -156,6 +158,7 @@ def at_full_size(photo: Photo, full: FullSize) -> Photo:
         lower_gum=(gum & ~full.above).astype(np.float32),
         dull=enlarged(photo.dull),
         void=((enlarged(photo.void) > 0.5) & full.valid).astype(np.float32),
+        covered=((enlarged(photo.covered) > 0.5) & ~tooth).astype(np.float32),
         valid=full.valid,
     )
 
@@ -217,6 +220,7 @@ def prepare_photo(
         lower_gum=(gum & ~dentition.above).astype(np.float32),
         dull=(1 - shiny).astype(np.float32),
         void=(void & valid).astype(np.float32),
+        covered=np.zeros((height, width), np.float32),
         valid=valid,
     )
 

@@ -1,0 +1,78 @@
+"""A lip that stands before the teeth in one photograph, told by the other photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from stages.init.dental.surface.dense import ArchSurface, dense_surface
+from tests.stages.dental_arch_scene import outline, scene
+
+TOOTH = 2
+#: Redder and darker than the made-up gum, within what passes for gum.
+LIP = np.array([0.55, 0.2, 0.24], np.float32)
+
+
+@functools.cache
+def plain():  # type: ignore[no-untyped-def]
+    return scene()
+
+
+@functools.cache
+def with_lip():  # type: ignore[no-untyped-def]
+    """The patient's right side, where a lip covers the lower teeth and gum of the left side.
+
+    Below the teeth it reaches further than any tooth can tell.
+    """
+    images, valid, dentitions, fit, truth = plain()
+    _, jaw, kind = truth[0]
+    lower = (kind == TOOTH) & (jaw == 2)
+    y, x = np.mgrid[: lower.shape[0], : lower.shape[1]]
+    columns, rows = np.flatnonzero(lower.any(axis=0)), np.flatnonzero(lower.any(axis=1))
+    edge = columns[-1] - 0.2 * len(columns)
+    lip = (y > rows[0] + 3) & (x > edge - 10 * (y > rows[-1] + 4)) & ((kind != TOOTH) | lower)
+    first, *rest = dentitions[0].lower
+    whole = dataclasses.replace(first, outline=outline(lower & ~lip))
+    seen = dataclasses.replace(dentitions[0], lower=(whole, *rest))
+    rng = np.random.default_rng(0)
+    image = images[0].copy()
+    image[lip] = LIP + rng.normal(scale=0.01, size=(int(lip.sum()), 1)).astype(np.float32)
+    return [image, *images[1:]], valid, [seen, *dentitions[1:]], fit, truth, lip
+
+
+@functools.cache
+def surface(lip: bool) -> ArchSurface:
+    return dense_surface(*(with_lip() if lip else plain())[:4], threads=2)
+
+
+def test_the_lip_is_not_gum() -> None:
+    covered = with_lip()[5] & (plain()[4][0][2] > 0)
+    shown, before = (surface(lip).views[0].depth > 0 for lip in (True, False))
+    assert before[covered].mean() > 0.5  # it stands before what would be seen
+    assert shown[covered].mean() < 0.05
+    elsewhere = before & ~with_lip()[5]
+    assert shown[elsewhere].mean() > 0.93  # all but a rim beside it
+
+
+def test_the_other_photographs_lose_nothing() -> None:
+    for with_it, without in zip(surface(True).views[1:], surface(False).views[1:], strict=True):
+        before = without.depth > 0
+        assert (with_it.depth > 0)[before].mean() > 0.99
+
+
+def test_what_no_other_photograph_shows_better_is_kept() -> None:
+    """One photograph alone can't tell."""
+    images, valid, dentitions, fit, _, lip = with_lip()
+    alone = dataclasses.replace(fit, views=[fit.views[0], None, None])
+    result = dense_surface(images, valid, dentitions, alone)
+    assert (result.views[0].depth > 0)[lip].any()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_change_nothing(threads: int) -> None:
+    again = dense_surface(*with_lip()[:4], threads=threads)
+    np.testing.assert_array_equal(again.views[0].depth, surface(True).views[0].depth)
+    np.testing.assert_array_equal(again.colors, surface(True).colors)
