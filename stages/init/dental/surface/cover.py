@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.init.dental.surface.chart.jaws import (
+    FACING_SMOOTHING,
     HIDDEN,
     PAST_EDGE,
     Chart,
@@ -26,7 +27,7 @@ from stages.init.dental.surface.chart.jaws import (
 )
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photo import Photo, joined_to
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
@@ -39,8 +40,6 @@ _WITHIN, _APART = 0.5, 0.8
 _NARROW = 0.5
 #: Share of a sample's surroundings from which it is tooth, or tissue.
 _HALF = 0.5
-#: Normals are smoothed over this length (mm): those of crowns, not of their grooves.
-_SMOOTH = 1.5
 #: The cut is made at so many pixels per mm, in so many rounds; a lip's edge is no sharper.
 _CUT_DENSITY, _CUT_ROUNDS = 4.0, 4
 #: Gum this close to the crowns (mm) says which colour it has.
@@ -84,7 +83,7 @@ def uncovered(
     contested = [np.zeros(photo.size, bool) for photo in photos]
     for chart in charts:
         points = chart.points
-        normals = smooth_normals(chart.radius, chart.grid, _SMOOTH)
+        normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
         used = chart.used(PAST_EDGE, options.gum_height)
         looks = [
             _look(photo, front, chart, points, normals)
@@ -150,10 +149,7 @@ def _marked(photo: Photo, covered: Mask, contested: Mask) -> Photo:
     wide = cv2.dilate(covered.astype(np.uint8), _disc(_APART * photo.density)) > 0
     covered = wide & ~tooth
     covered |= _of_its_colour(photo, covered & gum, gum & ~covered, tooth) & contested
-    count, label = cv2.connectedComponents((tooth | (gum & ~covered)).astype(np.uint8))
-    attached = np.zeros(count, bool)
-    attached[np.unique(label[tooth])] = True
-    covered |= gum & ~attached[label]
+    covered |= gum & ~joined_to(tooth | (gum & ~covered), tooth)
     free = (~covered).astype(np.float32)
     return replace(
         photo, upper_gum=photo.upper_gum * free, lower_gum=photo.lower_gum * free,
@@ -187,11 +183,7 @@ def _of_its_colour(photo: Photo, lip: Mask, gum: Mask, tooth: Mask) -> Mask:
     )  # fmt: skip
     like = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.uint8)
     like = cv2.resize(like, (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    count, label = cv2.connectedComponents(((like & gum) | lip).astype(np.uint8))
-    joined = np.zeros(count, bool)
-    joined[np.unique(label[lip])] = True
-    joined[0] = False
-    return joined[label]
+    return joined_to((like & gum) | lip, lip)
 
 
 def _disc(radius: float) -> npt.NDArray[np.uint8]:

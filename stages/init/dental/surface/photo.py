@@ -282,11 +282,16 @@ def find_gum(
     tissue = _fill_bright_holes(
         opened | tooth, smooth[..., 0] > _LIT * middle[0], _WET * density**2
     )
-    count, label = cv2.connectedComponents(tissue.astype(np.uint8), connectivity=4)
-    touching = np.zeros(count, bool)
-    touching[np.unique(label[tooth])] = True
-    touching[0] = False
-    return touching[label] & ~tooth
+    return joined_to(tissue, tooth) & ~tooth
+
+
+def joined_to(mask: Mask, seeds: Mask) -> Mask:
+    """[H, W] bool: the pieces of a mask [H, W] that hold one of the seeds [H, W]."""
+    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    held = np.zeros(count, bool)
+    held[np.unique(label[seeds])] = True
+    held[0] = False
+    return held[label]
 
 
 def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:

@@ -38,7 +38,7 @@ HIDDEN = 0.8
 #: guess (an option), high for a good match.
 _SURE = 2.0
 #: Smoothing of the normals that are given out, and of those that decide what faces a view (mm).
-_NORMAL_SMOOTHING, _FACING_SMOOTHING = 0.15, 1.5
+_NORMAL_SMOOTHING, FACING_SMOOTHING = 0.15, 1.5
 #: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
 #: move with the camera.
 _GUM_FADES = (0.5, 2.0)
@@ -156,7 +156,7 @@ def comparable(
 ) -> npt.NDArray[np.bool_]:
     """[V, H, W] bool: samples of a chart that a photograph shows well enough to compare."""
     points = chart.points
-    normals = smooth_normals(chart.radius, chart.grid, _FACING_SMOOTHING)
+    normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
     used = chart.used(PAST_EDGE, options.gum_height)
     masks = []
     for photo, front in zip(photos, nearest, strict=True):
