@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline.artifacts.dental.fdi import Jaw
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photo import Photo, disc
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
@@ -111,10 +111,10 @@ def find_tissue(
     known = total > _LEAST_VOTE
     share = (tooth + gum) / np.maximum(total, np.float32(1e-6))
     toothy = (tooth / np.maximum(total, np.float32(1e-6))).astype(np.float32)
-    disc = _disc(density)
+    narrow = disc(_RAGGED * density)
     rough = (known & (share > _LEAST_TISSUE)).astype(np.uint8)
-    closed = cv2.morphologyEx(rough, cv2.MORPH_CLOSE, disc)
-    kept = np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc)) > 0
+    closed = cv2.morphologyEx(rough, cv2.MORPH_CLOSE, narrow)
+    kept = np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, narrow)) > 0
     return _with_teeth(kept, known & (toothy > _LEAST_TISSUE), density), toothy
 
 
@@ -151,14 +151,8 @@ def even_rim(kept: Mask, tooth: Mask, beyond_gum: Array32, density: float) -> Ma
     least = ndimage.minimum_filter1d(furthest, size, mode="nearest")
     line = ndimage.gaussian_filter1d(least, size / 4, mode="nearest")
     even = (kept & (tooth | (beyond_gum <= line[None]))).astype(np.uint8)
-    opened = np.asarray(cv2.morphologyEx(even, cv2.MORPH_OPEN, _disc(density))) > 0
+    opened = np.asarray(cv2.morphologyEx(even, cv2.MORPH_OPEN, disc(_RAGGED * density))) > 0
     return _with_teeth(opened, tooth & kept, density)
-
-
-def _disc(density: float) -> npt.NDArray[np.uint8]:
-    size = max(int(_RAGGED * density), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(disc, np.uint8)
 
 
 def photo_weights(
@@ -182,9 +176,8 @@ def photo_weights(
 
 def _fading(dull: Array32, density: float) -> Array32:
     """1 away from highlights, 0 in them, with a soft rim: their glow goes further than they do."""
-    size = max(int(_GLOW * density), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(cv2.GaussianBlur(cv2.erode(dull, disc), (0, 0), _GLOW * density))
+    glow = _GLOW * density
+    return np.asarray(cv2.GaussianBlur(cv2.erode(dull, disc(glow)), (0, 0), glow))
 
 
 def find_gains(colours: list[list[Array32]], weights: list[list[Array32]], anchor: int) -> Array64:

@@ -274,15 +274,21 @@ def find_gum(
     # Gloves and lips under them are both lighter and less red than gum.
     pale = (away[..., 0] - away[..., 1]) / np.float32(np.sqrt(2))
     like = ((away**2).sum(-1) < deviations**2) & (pale < _PALE) & ~tooth
-    size = max(int(0.35 * density), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    small = disc(0.35 * density)
     # Small wet highlights on the gum are gum; thin red seams of a glove are not.
-    closed = cv2.morphologyEx((like | tooth).astype(np.uint8), cv2.MORPH_CLOSE, disc)
-    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc) > 0
+    closed = cv2.morphologyEx((like | tooth).astype(np.uint8), cv2.MORPH_CLOSE, small)
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, small) > 0
     tissue = _fill_bright_holes(
         opened | tooth, smooth[..., 0] > _LIT * middle[0], _WET * density**2
     )
     return joined_to(tissue, tooth) & ~tooth
+
+
+def disc(radius: float) -> npt.NDArray[np.uint8]:
+    """A disc of so many whole pixels, at least one, to erode and dilate with."""
+    size = max(int(radius), 1)
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    return np.asarray(shape, np.uint8)
 
 
 def joined_to(mask: Mask, seeds: Mask) -> Mask:
@@ -309,9 +315,8 @@ def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:
         return np.zeros(tooth.shape, bool)
     smooth = np.asarray(cv2.GaussianBlur(lightness, (0, 0), max(0.1 * density, 0.6)))
     dark = (smooth < _VOID * np.median(smooth[tooth])) & ~tooth
-    size = max(round(_VOID_SIZE / 2 * density), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0)
+    narrow = disc(round(_VOID_SIZE / 2 * density))
+    return np.asarray(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, narrow) > 0)
 
 
 def _fill_bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:

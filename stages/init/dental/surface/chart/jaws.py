@@ -21,7 +21,7 @@ from stages.init.dental.surface.chart.crown_shape import (
 from stages.init.dental.surface.chart.grid import ChartGrid, grid_around, normals_of
 from stages.init.dental.surface.chart.raster import nearest_of, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photo import Photo, disc
 from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
@@ -170,6 +170,4 @@ def comparable(
 def _near_tissue(photo: Photo, jaw: Jaw) -> Array32:
     """[h, w] float32: this jaw's teeth and gum and what is next to them."""
     tissue = np.maximum(photo.tooth_of(jaw), photo.gum_of(jaw))
-    size = max(int(_OUTLINE_ERROR * photo.density), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(cv2.dilate(tissue, disc), np.float32)
+    return np.asarray(cv2.dilate(tissue, disc(_OUTLINE_ERROR * photo.density)), np.float32)
