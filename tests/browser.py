@@ -51,8 +51,9 @@ def console(log: str) -> list[str]:
 
 
 def run_in(
-    text: str, script: str, folder: Path, size: tuple[int, int], address: str = ""
-) -> tuple[dict[str, Any], list[str]]:
+    text: str, script: str, folder: Path, size: tuple[int, int], address: str = "",
+    coarse: bool = False,
+) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
     """Run a script in a page; returns what it told, and the messages on the console.
 
     Args:
@@ -61,6 +62,8 @@ def run_in(
         folder: for the page and the profile.
         size: of the window; narrower than `NARROWEST` it is a frame.
         address: see `browse`.
+        coarse: two pixels of a page are one of the screen: scenes are drawn in a quarter of the
+            time.
     """
     page = folder / f"page{len(list(folder.iterdir()))}.html"
     page.write_text(text.replace("</body>", _TELL + f"<script>{script}</script></body>"))
@@ -71,7 +74,8 @@ def run_in(
         address = ""
     dom, log = browse(
         file, folder, (max(size[0], NARROWEST), size[1]), "--dump-dom",
-        "--virtual-time-budget=30000", address=address,
+        "--virtual-time-budget=30000", *["--force-device-scale-factor=0.5"] * coarse,
+        address=address,
     )  # fmt: skip
     told = re.search(r'<pre id="told">(.*?)</pre>', dom, re.S)
     assert told, f"the script told nothing: {console(log)}"

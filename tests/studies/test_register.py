@@ -6,9 +6,11 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from pipeline.cli import app
@@ -16,9 +18,10 @@ from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.rigid import exponential
 from pipeline.studies.register import comparing, movement, run_register, solving
 from pipeline.studies.register.comparing import compare_visits
+from pipeline.studies.register.estimate import Estimate
 from pipeline.studies.register.frame import first_frame
 from pipeline.studies.register.uncertainty import USUAL, misfit
-from pipeline.studies.register.visit import scale_of, textbook_scale
+from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import motion, toy_centres, toy_visit, write_visit
 
@@ -35,12 +38,26 @@ def motions() -> dict[int, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def found(motions: dict[int, np.ndarray]) -> comparing.Comparison:
+def ways() -> list[Estimate]:
+    """What `found` was made of: the estimate from the first visit to the second, and back."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def found(motions: dict[int, np.ndarray], ways: list[Estimate]) -> comparing.Comparison:
     second = toy_visit("second", motions, turn=3.0)
     frame = np.eye(4)
     frame[:3, :3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0]
     frame[:3, 3] = 20, -10, 5
-    return compare_visits(toy_visit("first"), second.in_frame(frame))
+    estimated = comparing.estimate
+
+    def kept(*visits_and_frame: Any) -> Estimate:
+        ways.append(estimated(*visits_and_frame))
+        return ways[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparing, "estimate", kept)
+        return compare_visits(toy_visit("first"), second.in_frame(frame))
 
 
 def test_known_movements_come_out(found: comparing.Comparison, motions: dict) -> None:
@@ -69,24 +86,18 @@ def test_intervals_hold_the_truth_and_say_who_moved(
 
 
 def test_pictures_that_do_not_fit_widen_the_interval(
-    found: comparing.Comparison, monkeypatch: pytest.MonkeyPatch
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One way is enough: where a tooth's pictures hardly agree, its motion may be another one."""
-    doubtful, estimated = 23, comparing.estimate
-    fits: list[dict[int, float]] = []
-
-    def doubted(first, *others):  # type: ignore[no-untyped-def]
-        made = estimated(first, *others)
-        fits.append(made.fits)
-        return replace(made, fits={**made.fits, doubtful: 0.4}) if len(fits) == 1 else made
-
-    monkeypatch.setattr(comparing, "estimate", doubted)
+    doubtful, (there, back) = 23, ways
+    doubted = iter([replace(there, fits={**there.fits, doubtful: 0.4}), back])
+    monkeypatch.setattr(comparing, "estimate", lambda *_: next(doubted))
     plain = {t.tooth: t for t in found.teeth}
     for tooth in compare_visits(found.first, found.second).teeth:
         number, before = tooth.tooth, plain[tooth.tooth].deviation
         wider = 1.0
         if number == doubtful:
-            wider = misfit(0.4) / misfit(min(way[number] for way in fits))
+            wider = misfit(0.4) / misfit(min(way.fits[number] for way in ways))
             assert wider > 3
         assert tooth.deviation == pytest.approx(wider * before), number
 
@@ -124,8 +135,12 @@ def test_nothing_moved_says_so() -> None:
 
 
 def test_two_patients_are_refused() -> None:
+    anna, berta = (
+        Visit(whole.name, whole.looks[1:3], teeth_points(whole.looks[1:3]))
+        for whole in (toy_visit("anna"), toy_visit("berta", patient=2))
+    )
     with pytest.raises(ReconstructionError, match="one patient"):
-        compare_visits(toy_visit("anna"), toy_visit("berta", patient=2))
+        compare_visits(anna, berta)
 
 
 def test_teeth_that_no_frame_brings_together_are_refused() -> None:
@@ -213,11 +228,19 @@ def workspaces(tmp_path_factory: pytest.TempPathFactory, motions: dict) -> tuple
     )
 
 
+@pytest.fixture(scope="module")
+def written(
+    workspaces: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Result]:
+    """The folder that the command writes, and how it ended."""
+    out = tmp_path_factory.mktemp("written") / "out"
+    return out, CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
+
+
 def test_the_command_writes_table_page_and_mesh(
-    workspaces: tuple[Path, Path], tmp_path: Path, motions: dict[int, np.ndarray]
+    written: tuple[Path, Result], motions: dict[int, np.ndarray]
 ) -> None:
-    out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
+    out, result = written
     assert result.exit_code == 0, result.output
     assert "12: " in result.output
     size = (out / "register.html").stat().st_size
@@ -338,8 +361,8 @@ PROBE = """
 
 
 @pytest.fixture(scope="module")
-def page(workspaces: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> str:
-    return run_register(*workspaces, tmp_path_factory.mktemp("page"))[0].read_text()
+def page(written: tuple[Path, Result]) -> str:
+    return (written[0] / "register.html").read_text()
 
 
 @needs_chromium
@@ -347,7 +370,7 @@ def page(workspaces: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
 def test_both_scenes_are_live_under_one_slider(
     page: str, tmp_path: Path, size: tuple[int, int]
 ) -> None:
-    told, log = run_in(page, PROBE, tmp_path, size)
+    told, log = run_in(page, PROBE, tmp_path, size, coarse=True)
     assert "failed" not in told, told
     assert log == []
     assert told["state"] == "live"
