@@ -66,13 +66,19 @@ chromium:
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
+# Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons.
+define install
+$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '$(1)'
+$(BIN)/python -m compileall -q -j 0 .venv/lib > /dev/null || true
+endef
+
 .venv/installed: .venv/bin/python setup.cfg constraints.txt
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	$(call install,.)
 	touch $@
 
-.venv/installed-dev: .venv/installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
+.venv/installed-dev: .venv/bin/python setup.cfg constraints.txt
+	$(call install,.[dev])
+	touch .venv/installed $@
 
 clean:
 	rm -rf .venv build dist runs *.egg-info
