@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,18 +21,11 @@ if TYPE_CHECKING:
     from stages.pointmaps.options import PointmapOptions
 
 
-#: Degrees by which rows of teeth may be turned for photographs to count as upright: half of what
-#: features do not stand (`roll.SMALLEST_ROLL`), for two may be turned against each other.
-UPRIGHT = 6.0
-#: How few and how many photographs the dental path takes on its own accord.
-DENTAL_VIEWS = (3, 12)
-
-
 class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 15
+    version = 16
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -177,115 +170,55 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 
 def _from_features(context: StageContext, views: Views) -> None:
+    """By features, or by teeth where these link photographs that features don't."""
+    from stages.init.dental.choice import ByTeeth, neither
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
     from stages.init.write import densify
 
     config: InitConfig = context.config
-    refinement = RefinementOptions(**config.refinement.model_dump())
-    if refinement.unroll and _stand_upright(context, views):
-        refinement = replace(refinement, unroll=False)
+    free = config.method == "auto"
+    by_teeth, options = ByTeeth(context, views), _classical_options(config)
+    focals = with_focals(views.views, config.focal)
     told: list[str] = []
+    if free and by_teeth.is_first(focals, options):
+        context.progress("features do not link the photographs; trying the teeth", 0, 1)
+        with suppress(ReconstructionError):
+            by_teeth.place()
+            return
+    refinement = RefinementOptions(**config.refinement.model_dump())
+    if refinement.unroll and by_teeth.upright():
+        refinement = replace(refinement, unroll=False)
     try:
         placement = place_classical(
-            list(views.views), with_focals(views.views, config.focal), config.focal is not None,
-            views.ordered, least_views(len(views), config.min_views_fraction),
-            _classical_options(config), refinement,
+            list(views.views), focals, config.focal is not None, views.ordered,
+            least_views(len(views), config.min_views_fraction), options, refinement,
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=told.append,
             pictures=config.match_pictures,
         )  # fmt: skip
     except ReconstructionError as unplaced:
-        if config.method != "auto":
+        if not free:
             raise
-        if not _teeth_to_try(context, views):
-            raise _with_what_was_set_aside(context, views, unplaced) from unplaced
-        _from_teeth_instead(context, views, unplaced)
+        if not by_teeth.to_try():
+            raise by_teeth.with_what_was_set_aside(unplaced) from unplaced
+        context.progress("features do not link the photographs; trying the teeth", 0, 1)
+        try:
+            by_teeth.place()
+        except ReconstructionError as doubtful:
+            raise neither(unplaced, doubtful) from doubtful
         return
-    placed = {camera.name for camera in placement.cameras}
-    if config.method == "auto" and _teeth_know_more(_teeth_to_try(context, views), placed):
-        from stages.init.dental.place import from_teeth
-
+    if free and by_teeth.knows_more({camera.name for camera in placement.cameras}):
         context.progress("features link few of the photographs; trying the teeth", 0, 1)
         try:
-            from_teeth(context, views)
+            by_teeth.place()
             return
         except ReconstructionError as doubtful:
             told.append(f"The teeth do not place more of the photographs: {doubtful}")
     for text in told:
         context.warn(text)
     densify(context, views, placement.normalised())
-
-
-def _teeth_know_more(shown: set[str], placed: set[str]) -> bool:
-    """Would the dental path place a mouth of which features have placed hardly any?
-
-    Two photographs of the front look alike and are linked; those of the sides, by which the arch
-    is known, are then missing. Features that do place enough of the mouth place it better.
-    """
-    return len(shown & placed) < DENTAL_VIEWS[0] <= len(shown)
-
-
-def _stand_upright(context: StageContext, views: Views) -> bool:
-    """Do the rows of teeth say that no photograph is rolled against the others?"""
-    if not context.has("teeth"):
-        return False
-    read = {dentition.name: dentition for dentition in context.load("teeth").chosen}
-    rolls = [abs(math.degrees(read[v.name].roll)) for v in views.views if v.name in read]
-    return len(rolls) == len(views) and max(rolls) < UPRIGHT
-
-
-def _teeth_to_try(context: StageContext, views: Views) -> set[str]:
-    """Views that the dental path may place; empty where it is not worth a try.
-
-    Few photographs, and of teeth.
-    """
-    from stages.init.dental.place import labelled_teeth
-
-    if not context.has("teeth"):
-        return set()
-    teeth = labelled_teeth(context, views)
-    shown = {dentition.name for dentition in teeth.chosen} & set(views.by_name())
-    return shown if DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1] else set()
-
-
-def _with_what_was_set_aside(
-    context: StageContext, views: Views, unplaced: ReconstructionError
-) -> ReconstructionError:
-    """The failure; where teeth were read, with the photographs that are missing for them."""
-    from stages.init.dental.place import labelled_teeth
-    from stages.init.place import photo_name
-
-    teeth = labelled_teeth(context, views) if context.has("teeth") else None
-    if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
-        return unplaced
-    names = {view.name: photo_name(view) for view in views.views}
-    aside = "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
-    without = f" ({aside})" if aside else ""
-    return ReconstructionError(
-        f"{unplaced} By their teeth at least {DENTAL_VIEWS[0]} photographs are needed that show "
-        f"the closed bite from the front and both sides, and {len(teeth.chosen)} of "
-        f"{len(teeth.views)} do{without}. Add what is missing; if one was set aside "
-        "wrongly or is a mirror image, say so in check.html.",
-        unplaced.pictures,
-        {**unplaced.artifacts, "teeth": teeth},
-    )
-
-
-def _from_teeth_instead(context: StageContext, views: Views, unplaced: ReconstructionError) -> None:
-    from stages.init.dental.place import from_teeth
-
-    context.progress("features do not link the photographs; trying the teeth", 0, 1)
-    try:
-        from_teeth(context, views)
-    except ReconstructionError as doubtful:
-        raise ReconstructionError(
-            f"Neither the texture nor the teeth place these photographs safely. By texture: "
-            f"{unplaced} By teeth: {doubtful}",
-            doubtful.pictures or unplaced.pictures,
-            doubtful.artifacts,
-        ) from doubtful
 
 
 def _classical_options(config: InitConfig) -> ClassicalOptions:
@@ -336,6 +269,7 @@ def _teeth_are_wide_apart(
 ) -> bool:
     """Few photographs of teeth with known cameras, too far apart for dense stereo."""
     from pipeline.geometry.models.known_cameras import pinhole_camera
+    from stages.init.dental.choice import ByTeeth
     from stages.init.dental.place_known import neighbour_angle
 
     config: InitConfig = context.config
@@ -344,7 +278,7 @@ def _teeth_are_wide_apart(
     posed = tuple(view for view in views.views if view.name in known)
     angle = neighbour_angle([pinhole_camera(view, known[view.name], CAMERAS) for view in posed])
     wide = angle > config.dental.wide_angle
-    return wide and bool(_teeth_to_try(context, replace(views, views=posed)))
+    return wide and bool(ByTeeth(context, replace(views, views=posed)).to_try())
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:

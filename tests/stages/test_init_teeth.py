@@ -1,15 +1,13 @@
-"""From the dental path's result to the stage's outputs, and when that path is chosen."""
+"""From the dental path's result to the stage's outputs."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.corrections import CORRECTIONS
 from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.artifacts.space.scale import Scale
-from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.teeth import Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
@@ -17,7 +15,6 @@ from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
 from stages.init.dental.reconstruct import with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
-from stages.init.placement import Placement
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import (
     LOWER,
@@ -246,109 +243,3 @@ def test_settings_reach_the_fit():
     with pytest.raises(RequestError, match="names 2 photographs"):
         place.arch_options(DentalConfig(order="right,left"), views)
     assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2
-
-
-@pytest.fixture
-def no_features(monkeypatch):
-    """Photographs that share nothing."""
-
-    def unplaced(*_, **__):
-        raise ReconstructionError("0 of 3 photographs could be placed.")
-
-    monkeypatch.setattr("stages.init.place.place_classical", unplaced)
-
-
-def auto(tmp_path, count, read=None, sources=None, **config):
-    inputs = {"views": photographs(count)} | ({"teeth": read} if read else {})
-    context = LocalContext(InitConfig(**config), tmp_path, inputs, sources or {}, threads=1)
-    InitStage().run(context)
-    return context
-
-
-def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch, no_features):
-    tried = []
-    monkeypatch.setattr(
-        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
-    )
-    none = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], "none") for k in range(3)))
-    refused = [
-        ("unread", 3, None, {}),
-        ("landscape", 3, none, {}),
-        ("features", 3, read_teeth(), {"method": "colmap"}),
-        ("pair", 2, read_teeth(2), {}),
-        ("aside", 3, read_teeth(aside=(0,)), {}),
-    ]
-    for name, count, read, settings in refused:
-        with pytest.raises(ReconstructionError, match="could be placed"):
-            auto(tmp_path / name, count, read, **settings)
-    assert not tried
-    auto(tmp_path / "teeth", 3, read_teeth())
-    assert tried == [1]
-    auto(tmp_path / "more", 4, read_teeth(4, aside=(3,)))
-    assert tried == [1, 1]
-
-
-def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
-    tmp_path, monkeypatch, no_features
-):
-    tried = []
-    monkeypatch.setattr(
-        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
-    )
-    read = read_teeth(aside=(0,))
-    with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
-        auto(tmp_path / "a", 3, read)
-    assert caught.value.artifacts == {"teeth": read}
-    said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
-    auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
-    assert tried == [1]
-
-
-def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypatch, no_features):
-    picture = {"teeth": np.zeros((4, 4, 3), np.uint8)}
-    read = {"teeth": read_teeth()}
-
-    def doubtful(context, views):
-        raise ReconstructionError("Photo 1 and 2 hardly agree.", picture, read)
-
-    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
-    with pytest.raises(ReconstructionError, match=r"could be placed.*hardly agree") as caught:
-        auto(tmp_path, 3, read_teeth())
-    assert caught.value.pictures == picture
-    assert caught.value.artifacts == read
-
-
-def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, monkeypatch):
-    """Two frontal photographs look alike: features link these and leave the sides out."""
-    tried, densified = [], []
-
-    def link(names):
-        cameras = [Camera(name, 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)) for name in names]
-        placement = Placement((), tuple(cameras), np.zeros((0, 3)), (), {})
-        monkeypatch.setattr(Placement, "normalised", lambda self: self)
-        monkeypatch.setattr("stages.init.place.place_classical", lambda *_, **__: placement)
-
-    monkeypatch.setattr("stages.init.write.densify", lambda *_: densified.append(1))
-    monkeypatch.setattr(
-        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
-    )
-    names = [view.name for view in photographs(4).views]
-    read = read_teeth(4, aside=(2,))
-    link([names[1], names[2]])
-    auto(tmp_path / "few", 4, read)
-    assert (tried, densified) == ([1], [])
-    auto(tmp_path / "as_asked", 4, read, method="colmap")
-    auto(tmp_path / "no_teeth", 4)
-    assert (tried, densified) == ([1], [1, 1])
-    link([names[0], names[1], names[3]])
-    auto(tmp_path / "enough", 4, read)
-    assert (tried, densified) == ([1], [1, 1, 1])
-
-    def doubtful(context, views):
-        raise ReconstructionError("Photo 1 and 2 hardly agree.")
-
-    link([names[1], names[2]])
-    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
-    context = auto(tmp_path / "doubtful", 4, read)
-    assert densified == [1, 1, 1, 1]
-    assert any("hardly agree" in text for text in context.warnings)

@@ -1,0 +1,121 @@
+"""Features or teeth: when photographs are placed by their teeth, and what is said of that."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pipeline.artifacts.views import Views
+from pipeline.errors import ReconstructionError
+from pipeline.stage import StageContext
+from stages.init.dental.place import from_teeth, labelled_teeth
+from stages.init.place import photo_name
+from stages.init.sfm.options import ClassicalOptions
+from stages.init.sfm.sounding import linked_at_most
+
+#: Degrees by which rows of teeth may be turned for photographs to count as upright: half of what
+#: features do not stand (`roll.SMALLEST_ROLL`), for two may be turned against each other.
+UPRIGHT = 6.0
+#: How few and how many photographs the dental path takes on its own accord.
+DENTAL_VIEWS = (3, 12)
+#: Of so many it is asked first whether features may link them: more around one mouth are never all
+#: as far apart as that they can't.
+SOUNDED_VIEWS = 6
+
+
+@dataclass
+class ByTeeth:
+    """The dental path as one of two ways; it is gone once at most.
+
+    Attributes:
+        context, views: of the stage.
+        failure: why it led nowhere.
+    """
+
+    context: StageContext
+    views: Views
+    failure: ReconstructionError | None = None
+
+    def place(self) -> None:
+        """Place the views by their teeth, and write what came out.
+
+        Raises:
+            ReconstructionError: as `from_teeth`; the second time the same at once.
+        """
+        if self.failure is None:
+            try:
+                return from_teeth(self.context, self.views)
+            except ReconstructionError as failure:
+                self.failure = failure
+        raise self.failure
+
+    def to_try(self) -> set[str]:
+        """Views that it may place; empty where it is not worth a try.
+
+        Few photographs, and of teeth.
+        """
+        if not self.context.has("teeth"):
+            return set()
+        teeth = labelled_teeth(self.context, self.views)
+        shown = {dentition.name for dentition in teeth.chosen} & set(self.views.by_name())
+        return shown if DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1] else set()
+
+    def upright(self) -> bool:
+        """Do the rows of teeth say that no photograph is rolled against the others?"""
+        if not self.context.has("teeth"):
+            return False
+        read = {dentition.name: dentition for dentition in self.context.load("teeth").chosen}
+        rolls = [abs(math.degrees(read[v.name].roll)) for v in self.views.views if v.name in read]
+        return len(rolls) == len(self.views) and max(rolls) < UPRIGHT
+
+    def is_first(self, focals: list[float | None], options: ClassicalOptions) -> bool:
+        """Few photographs that features won't link: finding that out would take longest of all.
+
+        Args:
+            focals: of each view in pixels, or None.
+            options: of the attempt by features.
+        """
+        if len(self.views) > SOUNDED_VIEWS or not self.to_try():
+            return False
+        linked = linked_at_most(
+            [view.gray() for view in self.views.views],
+            [view.valid() for view in self.views.views], focals, self.views.ordered, options,
+            seed=self.context.seed, threads=self.context.threads, scratch=self.context.scratch,
+        )  # fmt: skip
+        return linked < DENTAL_VIEWS[0]
+
+    def knows_more(self, placed: set[str]) -> bool:
+        """Would it place a mouth of which features have placed hardly any?
+
+        Two photographs of the front look alike and are linked; those of the sides, by which the
+        arch is known, are then missing. Features that do place enough of the mouth place it better.
+        """
+        shown = self.to_try()
+        return len(shown & placed) < DENTAL_VIEWS[0] <= len(shown)
+
+    def with_what_was_set_aside(self, unplaced: ReconstructionError) -> ReconstructionError:
+        """The failure of features; with the photographs that are missing for the teeth, if any."""
+        teeth = labelled_teeth(self.context, self.views) if self.context.has("teeth") else None
+        if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
+            return unplaced
+        names = {view.name: photo_name(view) for view in self.views.views}
+        aside = "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
+        without = f" ({aside})" if aside else ""
+        return ReconstructionError(
+            f"{unplaced} By their teeth at least {DENTAL_VIEWS[0]} photographs are needed that "
+            f"show the closed bite from the front and both sides, and {len(teeth.chosen)} of "
+            f"{len(teeth.views)} do{without}. Add what is missing; if one was set aside "
+            "wrongly or is a mirror image, say so in check.html.",
+            unplaced.pictures,
+            {**unplaced.artifacts, "teeth": teeth},
+        )
+
+
+def neither(unplaced: ReconstructionError, doubtful: ReconstructionError) -> ReconstructionError:
+    """The failure of both ways."""
+    return ReconstructionError(
+        f"Neither the texture nor the teeth place these photographs safely. By texture: "
+        f"{unplaced} By teeth: {doubtful}",
+        doubtful.pictures or unplaced.pictures,
+        doubtful.artifacts,
+    )

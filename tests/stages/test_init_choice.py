@@ -1,0 +1,176 @@
+"""Features or teeth: which of them places the photographs, and what is said of that."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.dental.corrections import CORRECTIONS
+from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.errors import ReconstructionError
+from pipeline.stage import LocalContext
+from stages.init.config import InitConfig
+from stages.init.placement import Placement
+from stages.init.sfm.options import ClassicalOptions
+from stages.init.sfm.sounding import linked_at_most
+from stages.init.stage import InitStage
+from tests.stages.init_teeth_case import SIZE, photographs, read_teeth
+from tests.teeth_case import write
+
+SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
+
+
+@pytest.fixture
+def no_features(monkeypatch):
+    """Photographs that share nothing."""
+
+    def unplaced(*_, **__):
+        raise ReconstructionError("0 of 3 photographs could be placed.")
+
+    monkeypatch.setattr("stages.init.place.place_classical", unplaced)
+
+
+def auto(tmp_path, count, read=None, sources=None, **config):
+    inputs = {"views": photographs(count)} | ({"teeth": read} if read else {})
+    context = LocalContext(InitConfig(**config), tmp_path, inputs, sources or {}, threads=1)
+    InitStage().run(context)
+    return context
+
+
+def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch, no_features):
+    tried = []
+    monkeypatch.setattr(
+        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+    )
+    none = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], "none") for k in range(3)))
+    refused = [
+        ("unread", 3, None, {}),
+        ("landscape", 3, none, {}),
+        ("features", 3, read_teeth(), {"method": "colmap"}),
+        ("pair", 2, read_teeth(2), {}),
+        ("aside", 3, read_teeth(aside=(0,)), {}),
+    ]
+    for name, count, read, settings in refused:
+        with pytest.raises(ReconstructionError, match="could be placed"):
+            auto(tmp_path / name, count, read, **settings)
+    assert not tried
+    auto(tmp_path / "teeth", 3, read_teeth())
+    assert tried == [1]
+    auto(tmp_path / "more", 4, read_teeth(4, aside=(3,)))
+    assert tried == [1, 1]
+
+
+def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
+    tmp_path, monkeypatch, no_features
+):
+    tried = []
+    monkeypatch.setattr(
+        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+    )
+    read = read_teeth(aside=(0,))
+    with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
+        auto(tmp_path / "a", 3, read)
+    assert caught.value.artifacts == {"teeth": read}
+    said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
+    auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
+    assert tried == [1]
+
+
+def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypatch, no_features):
+    picture = {"teeth": np.zeros((4, 4, 3), np.uint8)}
+    read = {"teeth": read_teeth()}
+
+    def doubtful(context, views):
+        raise ReconstructionError("Photo 1 and 2 hardly agree.", picture, read)
+
+    monkeypatch.setattr("stages.init.dental.choice.from_teeth", doubtful)
+    with pytest.raises(ReconstructionError, match=r"could be placed.*hardly agree") as caught:
+        auto(tmp_path, 3, read_teeth())
+    assert caught.value.pictures == picture
+    assert caught.value.artifacts == read
+
+
+def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, monkeypatch):
+    """Two frontal photographs look alike: features link these and leave the sides out."""
+    tried, densified = [], []
+    monkeypatch.setattr("stages.init.dental.choice.linked_at_most", lambda *_, **__: 4)
+
+    def link(names):
+        cameras = [Camera(name, 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)) for name in names]
+        placement = Placement((), tuple(cameras), np.zeros((0, 3)), (), {})
+        monkeypatch.setattr(Placement, "normalised", lambda self: self)
+        monkeypatch.setattr("stages.init.place.place_classical", lambda *_, **__: placement)
+
+    monkeypatch.setattr("stages.init.write.densify", lambda *_: densified.append(1))
+    monkeypatch.setattr(
+        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+    )
+    names = [view.name for view in photographs(4).views]
+    read = read_teeth(4, aside=(2,))
+    link([names[1], names[2]])
+    auto(tmp_path / "few", 4, read)
+    assert (tried, densified) == ([1], [])
+    auto(tmp_path / "as_asked", 4, read, method="colmap")
+    auto(tmp_path / "no_teeth", 4)
+    assert (tried, densified) == ([1], [1, 1])
+    link([names[0], names[1], names[3]])
+    auto(tmp_path / "enough", 4, read)
+    assert (tried, densified) == ([1], [1, 1, 1])
+
+    def doubtful(context, views):
+        raise ReconstructionError("Photo 1 and 2 hardly agree.")
+
+    link([names[1], names[2]])
+    monkeypatch.setattr("stages.init.dental.choice.from_teeth", doubtful)
+    context = auto(tmp_path / "doubtful", 4, read)
+    assert densified == [1, 1, 1, 1]
+    assert any("hardly agree" in text for text in context.warnings)
+
+
+def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_path, monkeypatch):
+    """Of what small copies say: the attempt by features takes longer than all else."""
+    order = []
+    monkeypatch.setattr(Placement, "normalised", lambda self: self)
+    monkeypatch.setattr("stages.init.write.densify", lambda *_: order.append("dense"))
+
+    def by_features(views, *_, **__):
+        order.append("features")
+        cameras = (Camera(v.name, 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)) for v in views)
+        return Placement((), tuple(cameras), np.zeros((0, 3)), (), {})
+
+    def by_teeth(context, views):
+        order.append("teeth")
+        if doubts:
+            raise ReconstructionError("Photo 1 and 2 hardly agree.")
+
+    monkeypatch.setattr("stages.init.place.place_classical", by_features)
+    monkeypatch.setattr("stages.init.dental.choice.from_teeth", by_teeth)
+    for linked, doubts, expected in (
+        (2, False, ["teeth"]),
+        (2, True, ["teeth", "features", "dense"]),
+        (3, False, ["features", "dense"]),
+    ):
+        monkeypatch.setattr(
+            "stages.init.dental.choice.linked_at_most", lambda *_, n=linked, **__: n
+        )
+        order.clear()
+        auto(tmp_path / f"{linked}_{doubts}", 3, read_teeth())
+        assert order == expected
+    order.clear()
+    auto(tmp_path / "as_asked", 3, read_teeth(), method="colmap")
+    assert order == ["features", "dense"]
+
+
+def test_a_sounding_tells_what_features_can_link(tmp_path):
+    samples = [
+        cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in sorted(SAMPLES.glob("*.jpg"))
+    ]
+    rng = np.random.default_rng(0)
+    other = cv2.GaussianBlur(rng.integers(0, 255, samples[0].shape, np.uint8), (0, 0), 3)
+    for grays, linked in ((samples, 3), ([*samples[:2], other], 2), ([samples[0], other], 1)):
+        assert linked == linked_at_most(
+            grays, [np.ones(gray.shape, bool) for gray in grays], [None] * len(grays), False,
+            ClassicalOptions(), seed=0, threads=1, scratch=tmp_path,
+        )  # fmt: skip
