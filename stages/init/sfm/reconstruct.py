@@ -11,7 +11,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.geometry.graph import Pair
-from stages.init.parallel import in_threads
+from pipeline.kernels.threads import in_threads
 from stages.init.sfm.mapping import MappingInput, Solution
 from stages.init.sfm.matching.features import (
     Features,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.geometry.graph import Pair
-from stages.init.parallel import in_threads
+from pipeline.kernels.threads import in_threads
 from stages.init.sfm.focal import better, search_focal
 from stages.init.sfm.mapping import Distortions, MappingInput, Solution, map_views
 from stages.init.sfm.matching.two_view import (

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from pipeline.artifacts.dental.fdi import JAWS, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
+from pipeline.kernels.threads import in_threads
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import view_angles
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
@@ -53,7 +54,6 @@ from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, p
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
-from stages.init.parallel import in_threads
 
 __all__ = ["ArchOptions", "fit_arch"]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.chart.crown_shape import beyond_crowns, within_crowns
 from stages.init.dental.surface.chart.grid import ChartGrid, faces_of
 from stages.init.dental.surface.chart.jaws import (
@@ -32,7 +33,6 @@ from stages.init.dental.surface.colour import (
 )
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo
-from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

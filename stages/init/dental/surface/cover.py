@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.chart.jaws import (
     FACING_SMOOTHING,
     HIDDEN,
@@ -29,7 +30,6 @@ from stages.init.dental.surface.chart.jaws import (
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo, disc, joined_to
-from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

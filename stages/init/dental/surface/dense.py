@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from pipeline.kernels import kernel_threads
+from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart.jaws import (
     PAST_EDGE,
@@ -34,7 +35,6 @@ from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
 from stages.init.dental.surface.sweep import choose_pairs, sweep
-from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.geometry.graph import Pair
-from stages.init.parallel import in_threads
+from pipeline.kernels.threads import in_threads
 from stages.init.sfm.matching.features import Features, oriented_features
 from stages.init.sfm.matching.match import match_features
 from stages.init.sfm.matching.two_view import coherent_matches, unrolled

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
+from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart.crown_shape import (
     JawShape,
@@ -22,7 +23,6 @@ from stages.init.dental.surface.chart.grid import ChartGrid, grid_around, normal
 from stages.init.dental.surface.chart.raster import nearest_of, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo, disc
-from stages.init.parallel import in_threads
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
