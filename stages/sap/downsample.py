@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,15 +48,33 @@ def voxel_index(
     Returns:
         Voxel of each point [N] int64, numbered in lexical order of the cells, and their count.
     """
-    points = np.asarray(positions, np.float64)
-    cells = np.floor((points - points.min(axis=0)) / np.reshape(size, (-1, 1))).astype(np.int64)
+    cells = _cells(positions, size)
     order = np.lexsort(cells.T[::-1])
     ranked = cells[order]
     fresh = np.ones(len(ranked), bool)
     fresh[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    index = np.empty(len(points), np.int64)
+    index = np.empty(len(cells), np.int64)
     index[order] = np.cumsum(fresh) - 1
     return index, int(fresh.sum())
+
+
+def _cells(
+    positions: npt.NDArray[np.floating], size: npt.NDArray[np.floating] | float
+) -> npt.NDArray[np.int64]:
+    """[N, 3] the cell that each point is in."""
+    points = np.asarray(positions, np.float64)
+    return np.floor((points - points.min(axis=0)) / np.reshape(size, (-1, 1))).astype(np.int64)
+
+
+def _count(positions: npt.NDArray[np.floating], size: float) -> int:
+    """How many voxels are occupied."""
+    cells = _cells(positions, size)
+    across = cells.max(axis=0) + 1
+    if math.prod(int(n) for n in across) >= 2**63:
+        return voxel_index(positions, size)[1]
+    keys = (cells[:, 0] * across[1] + cells[:, 1]) * across[2] + cells[:, 2]
+    keys.sort()
+    return 1 + int(np.count_nonzero(keys[1:] != keys[:-1]))
 
 
 def voxel_downsample(cloud: Cloud, size: float) -> Cloud:
@@ -110,13 +129,13 @@ def voxel_size_for(positions: npt.NDArray[np.floating], target: int, start: floa
     points = np.asarray(positions, np.float64)
     extent = float(np.ptp(points, axis=0).max())
     low, high = 0.0, max(start, extent * 1e-6)
-    while voxel_index(points, high)[1] > target:
+    while _count(points, high) > target:
         low, high = high, 2 * high
         if high > 4 * extent:
             break
     while high - low > 0.005 * high:
         middle = 0.5 * (low + high)
-        if voxel_index(points, middle)[1] > target:
+        if _count(points, middle) > target:
             low = middle
         else:
             high = middle
