@@ -15,6 +15,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
 from pipeline.geometry.pose_metrics import pose_figures
+from pipeline.kernels.threads import in_threads
 from pipeline.stage import StageContext
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.held_out import (
@@ -114,10 +115,9 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
         )
     if config.novel_angle > 0:
         middle = np.median(gaussians.means.astype(np.float64), axis=0)
-        novel = {
-            camera.name: examiner.novel(camera, surfaces)
-            for camera in beyond(list(cameras.values()), middle, config.novel_angle)
-        }
+        outside = beyond(list(cameras.values()), middle, config.novel_angle)
+        told = in_threads(lambda c: examiner.novel(c, surfaces), outside, context.threads)
+        novel = {camera.name: those for camera, those in zip(outside, told, strict=True)}
         if novel:
             figures["novel"] = {"degrees_beyond": config.novel_angle, "views": novel}
             figures["support_legend"] = LEGEND
@@ -168,24 +168,22 @@ def _input_views(
     """Figures of the views that made the scene, and what they show of it."""
     config: EvaluateConfig = context.config
     placed = [view for view in views.views if view.name in cameras]
-    pictured = set(pictures.spread(len(placed), config.max_comparisons))
-    figures: dict[str, Figures] = {}
-    surfaces, without_pixels = [], []
-    for index, view in enumerate(placed):
-        context.progress("render", index, len(placed), view=view.name)
-        if not view.valid().any():
-            without_pixels.append(view.name)
-            continue
-        figures[view.name], surface = examiner.examine(
-            view, cameras[view.name], pictured=index in pictured
-        )
-        surfaces.append(surface)
-    context.progress("render", len(placed), len(placed))
-    if not figures:
+    pictured = {placed[k].name for k in pictures.spread(len(placed), config.max_comparisons)}
+    without_pixels = [view.name for view in placed if not view.valid().any()]
+    shown = [view for view in placed if view.name not in without_pixels]
+    if not shown:
         raise RequestError(
             "The masks leave no pixel of any placed view, so there is nothing to compare. Check "
             "that white means 'use this pixel' in your masks."
         )
+    found = in_threads(
+        lambda view: examiner.examine(
+            view, cameras[view.name], pictured=view.name in pictured
+        ),
+        shown, context.threads, lambda done: context.progress("render", done, len(shown)),
+    )  # fmt: skip
+    figures = {view.name: scored for view, (scored, _) in zip(shown, found, strict=True)}
+    surfaces = [surface for _, surface in found]
     if without_pixels:
         context.warn(f"Not scored, because their masks are empty: {', '.join(without_pixels)}.")
     summary = summary_of(figures)

@@ -40,14 +40,14 @@ def _as_seen(gaussians: Gaussians, camera: Camera) -> tuple[Floats, int]:
     """The packed scene, and the degree of its harmonics."""
     if gaussians.light is not None:
         return lit_scene(gaussians, camera.centre), 0
-    packed = pack(
-        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
-        gaussians.sh,
-    )  # fmt: skip
     # trailing harmonics that are zero everywhere cost time and change nothing
     degree = 3
     while degree > 0 and not gaussians.sh[:, degree * degree : (degree + 1) ** 2].any():
         degree -= 1
+    packed = pack(
+        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
+        gaussians.sh[:, : (degree + 1) ** 2],
+    )  # fmt: skip
     return packed, degree
 
 
