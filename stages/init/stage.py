@@ -36,7 +36,7 @@ class InitStage(Stage):
     rehearsals = ("stages.init.rehearsal:teeth", "stages.init.rehearsal:features")
     methods = {  # noqa: RUF012
         "auto": "known where init.cameras is given; a model where init.pointmap.checkpoint is "
-        "given and one is installed; else colmap, and dental if that fails and teeth are found",
+        "given and one is installed; else colmap, or dental where features fail on teeth",
         "known": "cameras from a COLMAP model or transforms.json (init.cameras); dense stereo, or "
         "the surface of the teeth where few wide photographs show some",
         "colmap": "yaw-compensated SIFT, COLMAP's mappers, plane-sweep stereo; no network needed",
