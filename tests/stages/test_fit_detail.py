@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
-from stages.fit.config import FitConfig, resolve
-from stages.fit.numerics.detail import APART, SHRINK, divide, wide_axes, within
+from stages.fit.config import FitConfig, FitSettings, resolve
+from stages.fit.numerics.detail import APART, SHRINK, divide, fine, wide_axes, within
+from stages.fit.parts.detail import Detail
 from stages.fit.parts.start import coarse_factors, reduction
 
 
@@ -67,6 +70,50 @@ def test_the_largest_errors_come_first() -> None:
     axes[:, 2] = False
     chosen = within(axes, np.array([1.0, 4.0, 3.0, 2.0]), 7)
     assert chosen.any(1).tolist() == [False, True, True, False]
+
+
+def test_an_error_that_is_even_over_several_pixels_is_not_fine() -> None:
+    mask = np.zeros((40, 60), np.float32)
+    mask[:, :30] = 1
+    even = np.full((3, 40, 60), 0.3, np.float32)
+    assert np.abs(fine(even, mask)[:, :, :30]).max() < 1e-5  # at the mask's border, too
+    stripes = np.tile(np.where(np.arange(60) % 2, 0.1, -0.1).astype(np.float32), (3, 40, 1))
+    kept = fine(even + stripes, np.ones_like(mask))[:, 8:-8, 8:-8]
+    np.testing.assert_allclose(np.abs(kept), 0.1, atol=2e-3)
+
+
+@dataclass
+class Course:
+    """As much of a fit as the times of splits depend on."""
+
+    settings: FitSettings
+
+    @property
+    def iterations(self) -> int:
+        return self.settings.iterations
+
+    def reduction(self, iteration: int) -> int:
+        return reduction(self.settings, iteration, self.iterations)
+
+
+@pytest.mark.parametrize(
+    ("changes", "views", "held", "expected"),
+    [
+        ({}, 3, True, [80, 104, 128]),
+        ({}, 3, False, [280, 316, 352]),
+        ({"iterations": 100}, 12, False, [70]),
+        ({"iterations": 100, "coarse_factor": 4, "detail_rounds": 1}, 12, False, [35, 70, 88]),
+        ({"iterations": 100, "coarse_fraction": 0.0}, 3, False, [30, 60]),
+        ({"iterations": 100, "coarse_fraction": 0.0, "detail_rounds": 0}, 3, False, []),
+    ],
+)
+def test_the_last_steps_let_what_was_split_settle(changes, views, held, expected) -> None:  # type: ignore[no-untyped-def]
+    settings = resolve(FitConfig(**changes), views, 0, held)
+    fit = Course(settings)
+    part = Detail.__new__(Detail)
+    part.settings = settings
+    assert part._times(fit) == expected  # type: ignore[arg-type]
+    assert not expected or expected[-1] <= 0.88 * fit.iterations
 
 
 def test_a_start_from_more_points_for_larger_pictures() -> None:

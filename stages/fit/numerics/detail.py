@@ -1,7 +1,8 @@
-"""Gaussians in parts."""
+"""Gaussians in parts, and what is fine in an image."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from stages.fit.arrays import Array, Bools, Floats, Indices
@@ -10,6 +11,8 @@ from stages.fit.numerics.density import rotations
 #: halves of a Gaussian lie this many of its standard deviations from its middle, and are narrower
 #: by this factor: a little less wide together than it was, since what is split is to show more
 APART, SHRINK = 0.5, 0.6
+#: what a blur of this standard deviation, in pixels, leaves of an image is not fine
+COARSE = 2.0
 
 
 def wide_axes(packed: Floats, pixel: Floats, least: float) -> Bools:
@@ -52,3 +55,13 @@ def divide(packed: Floats, axes: Bools) -> tuple[Floats, Indices, Bools]:
     result[:, :3] += np.einsum("nij,nj->ni", rotations(result[:, 3:7]), moved)
     result[:, 7:10] += np.log(np.float32(SHRINK)) * axes[source]
     return np.ascontiguousarray(result), source, np.asarray(axes[source].any(1))
+
+
+def fine(image: Floats, mask: Floats) -> Floats:
+    """[3, H, W] an image without what is even around each pixel, inside a mask [H, W]."""
+    around = np.maximum(cv2.GaussianBlur(mask, (0, 0), COARSE), np.float32(1e-3))
+    planes = [
+        plane - np.asarray(cv2.GaussianBlur(plane * mask, (0, 0), COARSE), np.float32) / around
+        for plane in image
+    ]
+    return np.stack(planes)
