@@ -70,6 +70,7 @@ FIGURES = {
     "ssim": Figure("SSIM", 3),
     "lpips": Figure("LPIPS", 3),
     "flip": Figure("FLIP", 3),
+    "detail": Figure("fine detail %", 0, 100),
     "psnr_mask": Figure("PSNR teeth dB", 2),
     "ssim_mask": Figure("SSIM teeth", 3),
     "coverage": Figure("covered %", 1, 100),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from stages.evaluate.images.metrics import psnr, ssim, ssim_map
+from stages.evaluate.images.metrics import detail, psnr, ssim, ssim_map
 from stages.evaluate.images.pictures import GAP, comparison, error_map, spread
 from stages.evaluate.images.score import LARGEST_PSNR, score_view, summary_of
 
@@ -42,6 +42,23 @@ def test_psnr_counts_only_the_mask() -> None:
     top[:5] = True
     assert psnr(image, truth, top) == pytest.approx(13.979400, abs=1e-6)
     assert psnr(image, truth, ~top) == pytest.approx(-10 * math.log10(0.16), abs=1e-6)
+
+
+def test_detail_is_the_share_of_the_power_that_is_left() -> None:
+    """Half of a fine pattern's amplitude is a quarter of its power; what is even has no say."""
+    checks = np.indices((40, 60)).sum(0) % 2 * 2 - 1
+    truth, soft = (
+        np.repeat((128 + size * checks)[..., None], 3, 2).astype(np.uint8) for size in (40, 20)
+    )
+    assert detail(truth, truth) == pytest.approx(1)
+    assert detail(soft, truth) == pytest.approx(0.25, abs=1e-6)
+    assert detail(soft + np.uint8(30), truth) == pytest.approx(0.25, abs=1e-6)
+    assert detail(truth, np.full_like(truth, 128)) is None
+    left = np.zeros((40, 60), bool)
+    left[:, :30] = True
+    half = np.where(left[..., None], soft, truth)
+    assert detail(half, truth, left) == pytest.approx(0.25, abs=0.01)
+    assert detail(half, truth, ~left) == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.parametrize("level", [3, 20, 80])

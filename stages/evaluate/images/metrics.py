@@ -18,6 +18,10 @@ SSIM_WINDOW = 11
 #: SSIM's constants for a dynamic range of 1.
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+#: Blur, in pixels, that takes the finest octave away, and its window.
+FINE_SIGMA, FINE_WINDOW = 1.0, 9
+#: Variance of rounding to 8 bits: less than that is no detail.
+ROUNDING = 1 / 255**2 / 12
 
 
 def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
@@ -39,6 +43,33 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
     error = (first - second) ** 2
     mean = float((error if mask is None else error[mask]).mean())
     return math.inf if mean == 0 else -10.0 * math.log10(mean)
+
+
+def detail(image: Image, truth: Image, mask: Mask | None = None) -> float | None:
+    """How sharp an image is beside the truth: the power of its fine detail over that of the truth's.
+
+    Fine is what a blur of `FINE_SIGMA` takes away, in the mean of the channels: about the finest
+    octave. It says nothing about whether that detail is in the right place, as PSNR and SSIM do.
+
+    Args:
+        image, truth: [H, W, 3] or [H, W] uint8.
+        mask: [H, W] pixels that count, where all of their surroundings do; None for all.
+
+    Returns:
+        1 for equal images, below 1 for a softer one; None where the truth has no fine detail.
+
+    Raises:
+        ValueError: the shapes differ, or the mask has no pixel.
+    """
+    counted = np.ones(truth.shape[:2], bool) if mask is None else mask
+    window = np.ones((FINE_WINDOW, FINE_WINDOW), np.uint8)
+    counted = cv2.erode(counted.astype(np.uint8), window) > 0
+    powers = []
+    for pixels in _pair(image, truth, mask):
+        grey = pixels if pixels.ndim == 2 else pixels.mean(2)
+        fine = grey - cv2.GaussianBlur(grey, (FINE_WINDOW, FINE_WINDOW), FINE_SIGMA)
+        powers.append(float(np.square(fine[counted]).mean()) if counted.any() else 0.0)
+    return powers[0] / powers[1] if powers[1] > ROUNDING else None
 
 
 def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:

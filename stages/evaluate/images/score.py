@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stages.evaluate.images.metrics import psnr, ssim
+from stages.evaluate.images.metrics import detail, psnr, ssim
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -27,7 +27,9 @@ SMALLEST_LPIPS = 16
 #: Figures of which less is better.
 LOWER_IS_BETTER = ("lpips", "flip", "unsupported")
 #: Figures that have a mean and a worst view, in this order; `pixels` says nothing about quality.
-SUMMARISED = ("psnr", "ssim", "lpips", "flip", "coverage", "unsupported", "psnr_mask", "ssim_mask")
+SUMMARISED = (
+    "psnr", "ssim", "lpips", "flip", "detail", "coverage", "unsupported", "psnr_mask", "ssim_mask",
+)  # fmt: skip
 
 
 def score_view(
@@ -52,7 +54,7 @@ def score_view(
 
     Returns:
         psnr (dB, at most `LARGEST_PSNR`), ssim, lpips (None without `lpips`), flip (if asked for),
-        coverage (share of pixels with alpha above `COVERED`) and pixels (share of the image that
+        detail (power of fine detail over the photograph's; None where that has none), coverage (share of pixels with alpha above `COVERED`) and pixels (share of the image that
         counts); with a region that has pixels psnr_mask and ssim_mask, of it alone. LPIPS and FLIP
         look at neighbourhoods: pixels that do not count are black in both pictures.
     """
@@ -61,6 +63,7 @@ def score_view(
         "psnr": min(psnr(render, photo, whole), LARGEST_PSNR),
         "ssim": ssim(render, photo, whole),
         "lpips": None,
+        "detail": detail(render, photo, whole),
         "coverage": float((alpha[mask] > COVERED).mean()),
         "pixels": float(mask.mean()),
     }
