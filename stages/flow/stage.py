@@ -120,6 +120,7 @@ class FlowStage(Stage):
 
 
 def _run(context: StageContext) -> None:
+    from pipeline.kernels.threads import in_threads
     from stages.flow.geometry import splat_depth
     from stages.flow.pair import Estimator, Side, Trust, flow_between
 
@@ -139,16 +140,15 @@ def _run(context: StageContext) -> None:
     pairs, too_wide = _choose_pairs(views, cameras if placed else None, points, config)
     _warn_of_missing(context, len(views), len(cameras), len(pairs), too_wide)
 
-    sides: dict[str, Side] = {}
-
     def side(view: View) -> Side:
-        if view.name not in sides:
-            camera = cameras.get(view.name)
-            depth = None
-            if camera is not None and points is not None and geometry:
-                depth = splat_depth(points.positions, points.scale, camera)
-            sides[view.name] = Side(view.image, view.valid(), camera, depth)
-        return sides[view.name]
+        camera = cameras.get(view.name)
+        depth = None
+        if camera is not None and points is not None and geometry:
+            depth = splat_depth(points.positions, points.scale, camera)
+        return Side(view.image, view.valid(), camera, depth)
+
+    shown = {view.name: view for pair in pairs for view in pair}
+    sides = dict(zip(shown, in_threads(side, shown.values(), context.threads), strict=True))
 
     estimator = Estimator(
         method=config.method,
@@ -166,9 +166,12 @@ def _run(context: StageContext) -> None:
     results: list[FlowPair] = []
     deviations = []
     shares = []
-    for done, (view_i, view_j) in enumerate(pairs):
-        context.progress("flow", done, len(pairs), pair=f"{view_i.name}-{view_j.name}")
-        forward, backward = flow_between(side(view_i), side(view_j), estimator, trust)
+    context.progress("flow", 0, len(pairs))
+    found = in_threads(
+        lambda pair: flow_between(sides[pair[0].name], sides[pair[1].name], estimator, trust),
+        pairs, context.threads, lambda done: context.progress("flow", done, len(pairs)),
+    )  # fmt: skip
+    for (view_i, view_j), (forward, backward) in zip(pairs, found, strict=True):
         share = 0.5 * float(forward.mask.mean() + backward.mask.mean())
         if share < _POOR_SHARE:
             context.warn(
@@ -183,7 +186,6 @@ def _run(context: StageContext) -> None:
                 forward.flow, backward.flow, forward.mask, backward.mask,
             )
         )  # fmt: skip
-    context.progress("flow", len(pairs), len(pairs))
     context.save(Flow(tuple(sorted(results, key=lambda pair: (pair.name_i, pair.name_j)))))
 
     figures: dict[str, float | int | str] = {

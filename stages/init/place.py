@@ -18,6 +18,7 @@ from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole, roun
 from stages.init.config import CAMERAS
 from stages.init.placement import Placement
 from stages.init.sfm.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
+from stages.init.sfm.matching.features import Features
 from stages.init.sfm.matching.pictures import Links, match_pictures
 from stages.init.sfm.matching.two_view import Correspondences
 from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
@@ -48,6 +49,7 @@ def place_classical(
     views: list[View], focals: list[float | None], focal_given: bool, ordered: bool,
     least_views: int, options: ClassicalOptions, refinement: RefinementOptions, *, seed: int,
     threads: int, scratch: Path, progress: Progress, warn: Warn, pictures: int = 0,
+    plain_features: list[Features] | None = None,
 ) -> Placement:  # fmt: skip
     """Cameras from features and COLMAP's mappers (`stages.init.sfm.reconstruct`).
 
@@ -57,6 +59,7 @@ def place_classical(
         ordered: the views are a sequence.
         least_views: with fewer placed it is a failure.
         pictures: at most so many pairs are drawn for the message of a failure.
+        plain_features: those of the views without squeezed copies, if they have been found.
 
     Raises:
         ReconstructionError: the photographs don't allow it; the message is the diagnosis.
@@ -65,7 +68,7 @@ def place_classical(
     attempt = reconstruct(
         [view.gray() for view in views], [view.valid() for view in views], focals, focal_given,
         ordered, options, seed=seed, threads=threads, scratch=scratch, progress=progress,
-        refinement=refinement,
+        refinement=refinement, plain_features=plain_features,
     )  # fmt: skip
     names = [photo_name(view) for view in views]
     limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)

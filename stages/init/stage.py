@@ -196,7 +196,7 @@ def _from_features(context: StageContext, views: Views) -> None:
             least_views(len(views), config.min_views_fraction), options, refinement,
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=told.append,
-            pictures=config.match_pictures,
+            pictures=config.match_pictures, plain_features=by_teeth.features,
         )  # fmt: skip
     except ReconstructionError as unplaced:
         if not free:

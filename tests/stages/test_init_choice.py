@@ -14,7 +14,7 @@ from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
 from stages.init.placement import Placement
 from stages.init.sfm.options import ClassicalOptions
-from stages.init.sfm.sounding import linked_at_most
+from stages.init.sfm.sounding import Sounding, sound
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import SIZE, photographs, read_teeth
 from tests.teeth_case import write
@@ -42,7 +42,7 @@ def auto(tmp_path, count, read=None, sources=None, **config):
 def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatch, no_features):
     tried = []
     monkeypatch.setattr(
-        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
     none = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], "none") for k in range(3)))
     refused = [
@@ -67,7 +67,7 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
 ):
     tried = []
     monkeypatch.setattr(
-        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
     read = read_teeth(aside=(0,))
     with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
@@ -85,7 +85,7 @@ def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypat
     def doubtful(context, views):
         raise ReconstructionError("Photo 1 and 2 hardly agree.", picture, read)
 
-    monkeypatch.setattr("stages.init.dental.choice.from_teeth", doubtful)
+    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
     with pytest.raises(ReconstructionError, match=r"could be placed.*hardly agree") as caught:
         auto(tmp_path, 3, read_teeth())
     assert caught.value.pictures == picture
@@ -95,7 +95,7 @@ def test_both_diagnoses_are_told_and_pictures_and_teeth_kept(tmp_path, monkeypat
 def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, monkeypatch):
     """Two frontal photographs look alike: features link these and leave the sides out."""
     tried, densified = [], []
-    monkeypatch.setattr("stages.init.dental.choice.linked_at_most", lambda *_, **__: 4)
+    monkeypatch.setattr("stages.init.dental.choice.sound", lambda *_, **__: Sounding(4))
 
     def link(names):
         cameras = [Camera(name, 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)) for name in names]
@@ -105,7 +105,7 @@ def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, 
 
     monkeypatch.setattr("stages.init.write.densify", lambda *_: densified.append(1))
     monkeypatch.setattr(
-        "stages.init.dental.choice.from_teeth", lambda context, views: tried.append(1)
+        "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
     names = [view.name for view in photographs(4).views]
     read = read_teeth(4, aside=(2,))
@@ -123,7 +123,7 @@ def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, 
         raise ReconstructionError("Photo 1 and 2 hardly agree.")
 
     link([names[1], names[2]])
-    monkeypatch.setattr("stages.init.dental.choice.from_teeth", doubtful)
+    monkeypatch.setattr("stages.init.dental.place.from_teeth", doubtful)
     context = auto(tmp_path / "doubtful", 4, read)
     assert densified == [1, 1, 1, 1]
     assert any("hardly agree" in text for text in context.warnings)
@@ -146,14 +146,14 @@ def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_pa
             raise ReconstructionError("Photo 1 and 2 hardly agree.")
 
     monkeypatch.setattr("stages.init.place.place_classical", by_features)
-    monkeypatch.setattr("stages.init.dental.choice.from_teeth", by_teeth)
+    monkeypatch.setattr("stages.init.dental.place.from_teeth", by_teeth)
     for linked, doubts, expected in (
         (2, False, ["teeth"]),
         (2, True, ["teeth", "features", "dense"]),
         (3, False, ["features", "dense"]),
     ):
         monkeypatch.setattr(
-            "stages.init.dental.choice.linked_at_most", lambda *_, n=linked, **__: n
+            "stages.init.dental.choice.sound", lambda *_, n=linked, **__: Sounding(n)
         )
         order.clear()
         auto(tmp_path / f"{linked}_{doubts}", 3, read_teeth())
@@ -170,7 +170,16 @@ def test_a_sounding_tells_what_features_can_link(tmp_path):
     rng = np.random.default_rng(0)
     other = cv2.GaussianBlur(rng.integers(0, 255, samples[0].shape, np.uint8), (0, 0), 3)
     for grays, linked in ((samples, 3), ([*samples[:2], other], 2), ([samples[0], other], 1)):
-        assert linked == linked_at_most(
-            grays, [np.ones(gray.shape, bool) for gray in grays], [None] * len(grays), False,
-            ClassicalOptions(), seed=0, threads=1, scratch=tmp_path,
+        valid = [np.ones(gray.shape, bool) for gray in grays]
+        sounding = sound(
+            grays, valid, [None] * len(grays), False, ClassicalOptions(),
+            seed=0, threads=1, scratch=tmp_path,
         )  # fmt: skip
+        assert sounding.linked == linked
+        assert sounding.features is not None  # the samples are no larger than what is asked
+    larger = [cv2.resize(gray, None, fx=1.5, fy=1.5) for gray in samples]
+    sounding = sound(
+        larger, [np.ones(gray.shape, bool) for gray in larger], [None] * 3, False,
+        ClassicalOptions(), seed=0, threads=1, scratch=tmp_path,
+    )  # fmt: skip
+    assert sounding.linked == 3 and sounding.features is None

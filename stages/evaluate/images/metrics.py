@@ -46,7 +46,7 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
 
 
 def detail(image: Image, truth: Image, mask: Mask | None = None) -> float | None:
-    """How sharp an image is beside the truth: the power of its fine detail over that of the truth's.
+    """How sharp an image is: the power of its fine detail over that of the truth's.
 
     Fine is what a blur of `FINE_SIGMA` takes away, in the mean of the channels: about the finest
     octave. It says nothing about whether that detail is in the right place, as PSNR and SSIM do.

@@ -54,9 +54,10 @@ def score_view(
 
     Returns:
         psnr (dB, at most `LARGEST_PSNR`), ssim, lpips (None without `lpips`), flip (if asked for),
-        detail (power of fine detail over the photograph's; None where that has none), coverage (share of pixels with alpha above `COVERED`) and pixels (share of the image that
-        counts); with a region that has pixels psnr_mask and ssim_mask, of it alone. LPIPS and FLIP
-        look at neighbourhoods: pixels that do not count are black in both pictures.
+        detail (power of fine detail over the photograph's; None where that has none), coverage
+        (share of pixels with alpha above `COVERED`) and pixels (share of the image that counts);
+        with a region that has pixels psnr_mask and ssim_mask, of it alone. LPIPS and FLIP look at
+        neighbourhoods: pixels that do not count are black in both pictures.
     """
     whole = None if mask.all() else mask
     figures: Figures = {

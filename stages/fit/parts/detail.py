@@ -41,8 +41,8 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         detail: bool = True
         """split Gaussians where the photographs show more than they do, each time the images get
         larger"""
-        # three photographs of a street gain 3 dB and .2 of their sharpness by it, three real ones of
-        # teeth .1 to .2 of it with as many Gaussians; unseen views stay as they are. Twelve views,
+        # three photographs of a street gain 3 dB and .2 of their sharpness by it, three real ones
+        # of teeth .1 of it with as many Gaussians; unseen views stay as they are. Twelve views,
         # which densification serves, gain nothing
         detail_rounds: AutoInt = automatic({5: 2, 6: 0}, held=2)
         """and so many times more at full size"""
@@ -74,9 +74,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         """The iterations after which Gaussians are split."""
         s, count = self.settings, len(coarse_factors(self.settings))
         coarse = s.coarse_fraction * fit.iterations if count else 0.0
-        grown = [
-            k for k in range(1, fit.iterations) if fit.reduction(k + 1) < fit.reduction(k)
-        ]
+        grown = [k for k in range(1, fit.iterations) if fit.reduction(k + 1) < fit.reduction(k)]
         rounds = s.detail_rounds
         step = SETTLED * (fit.iterations - coarse) / max(rounds, 1)
         return sorted({*grown, *(round(coarse + step * (k + 1)) for k in range(rounds))})

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import StageContext
-from stages.init.dental.place import from_teeth, labelled_teeth
+from stages.init.dental.read import labelled_teeth
 from stages.init.place import photo_name
+from stages.init.sfm.matching.features import Features
 from stages.init.sfm.options import ClassicalOptions
-from stages.init.sfm.sounding import linked_at_most
+from stages.init.sfm.sounding import sound
 
 #: Degrees by which rows of teeth may be turned for photographs to count as upright: half of what
 #: features do not stand (`roll.SMALLEST_ROLL`), for two may be turned against each other.
@@ -30,11 +31,13 @@ class ByTeeth:
     Attributes:
         context, views: of the stage.
         failure: why it led nowhere.
+        features: of the views, if they had to be found to ask whether they link them.
     """
 
     context: StageContext
     views: Views
     failure: ReconstructionError | None = None
+    features: list[Features] | None = None
 
     def place(self) -> None:
         """Place the views by their teeth, and write what came out.
@@ -42,6 +45,8 @@ class ByTeeth:
         Raises:
             ReconstructionError: as `from_teeth`; the second time the same at once.
         """
+        from stages.init.dental.place import from_teeth
+
         if self.failure is None:
             try:
                 return from_teeth(self.context, self.views)
@@ -77,12 +82,13 @@ class ByTeeth:
         """
         if len(self.views) > SOUNDED_VIEWS or not self.to_try():
             return False
-        linked = linked_at_most(
+        sounding = sound(
             [view.gray() for view in self.views.views],
             [view.valid() for view in self.views.views], focals, self.views.ordered, options,
             seed=self.context.seed, threads=self.context.threads, scratch=self.context.scratch,
         )  # fmt: skip
-        return linked < DENTAL_VIEWS[0]
+        self.features = sounding.features
+        return sounding.linked < DENTAL_VIEWS[0]
 
     def knows_more(self, placed: set[str]) -> bool:
         """Would it place a mouth of which features have placed hardly any?

@@ -10,13 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.corrections import (
-    CORRECTIONS,
-    Corrections,
-    CrownCorrection,
-    PhotoCorrection,
-    read_corrections,
-)
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import Scale, Source
@@ -27,9 +20,9 @@ from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
 from pipeline.geometry.graph import Pair
 from pipeline.stage import StageContext
-from stages.dentition.corrections import apply_corrections
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
@@ -76,32 +69,6 @@ def from_teeth(context: StageContext, views: Views) -> None:
         context.warn(doubt)
     context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
     _write(context, given, teeth)
-
-
-def labelled_teeth(context: StageContext, views: Views) -> TeethArtifact:
-    """The teeth that were read from the photographs, with what a person has said of them.
-
-    Raises:
-        RequestError: the stage `teeth` has not run, or what was said fits no crown.
-    """
-    if not context.has("teeth"):
-        raise RequestError(
-            "The teeth of these photographs have not been read. Name the stage `teeth` before "
-            "`init`, as in --stages teeth,init."
-        )
-    read: TeethArtifact = context.load("teeth")
-    for label, path in context.sources.items():
-        if label == CORRECTIONS:
-            read = apply_corrections(read, views, read_corrections(path))
-    said = context.config.dental.labels
-    if not isinstance(said, str) and said:
-        photographs: dict[str, PhotoCorrection] = {}
-        for hint in said:
-            before = photographs.get(hint.photo, PhotoCorrection())
-            crown = CrownCorrection((hint.x, hint.y), hint.tooth)
-            photographs[hint.photo] = replace(before, crowns=(*before.crowns, crown))
-        read = apply_corrections(read, views, Corrections(photographs, "init.dental.labels"))
-    return read
 
 
 def chosen_dentitions(read: TeethArtifact, views: Views) -> list[Dentition | None]:

@@ -25,12 +25,12 @@ from stages.init.config import CAMERAS, InitConfig
 from stages.init.dental.cameras.centred import CentredView, centre_view
 from stages.init.dental.place import (
     arch_options,
-    labelled_teeth,
     masked,
     neighbours,
     surface_options,
     tooth_counts,
 )
+from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.surface.options import SweepRound
 from stages.init.place import photo_name

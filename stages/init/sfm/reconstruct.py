@@ -107,6 +107,7 @@ def reconstruct(
     scratch: Path,
     progress: Progress,
     refinement: RefinementOptions = REFINEMENT,
+    plain_features: list[Features] | None = None,
 ) -> Attempt:
     """Find cameras and sparse points.
 
@@ -120,6 +121,7 @@ def reconstruct(
         scratch: folder for the mapper's files.
         progress: called with (step, done, total).
         refinement: settings of the last adjustment.
+        plain_features: what `find_features` finds without squeezed copies, if that has been done.
     """
     side = max(max(gray.shape) for gray in grays)
     pixel = side / REFERENCE_SIDE
@@ -138,7 +140,8 @@ def reconstruct(
 
         plain = tuple(squeeze for squeeze in options.squeezes if squeeze == 1) or options.squeezes
         first = replace(options, squeezes=plain)
-        features = find_features(grays, valid, first, threads, progress, rolls, scratch)
+        features = list(plain_features or ()) if plain == (1.0,) and not any(rolls) else []
+        features = features or find_features(grays, valid, first, threads, progress, rolls, scratch)
         counts = overlaps(features, ordered, options)
         near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
         found = match_pairs(features, near, options, pixel, threads, progress)

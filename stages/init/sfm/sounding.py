@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from stages.init.sfm.mapping import MappingInput
-from stages.init.sfm.matching.features import reduced
+from stages.init.sfm.matching.features import Features, reduced
 from stages.init.sfm.matching.roll import groups
 from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions
 from stages.init.sfm.reconstruct import find_features, group_lenses, match_pairs, overlaps
@@ -23,7 +23,19 @@ from stages.init.sfm.solver import Solver
 SHARE = 0.1
 
 
-def linked_at_most(
+@dataclass(frozen=True)
+class Sounding:
+    """Attributes:
+    linked: how many of the views there is any hope for that features link them with each other.
+    features: those of the views themselves, without squeezed copies; None where smaller ones than
+        the views were asked.
+    """
+
+    linked: int
+    features: list[Features] | None = None
+
+
+def sound(
     grays: list[npt.NDArray[np.uint8]],
     valid: list[npt.NDArray[np.bool_]],
     focals: list[float | None],
@@ -33,8 +45,8 @@ def linked_at_most(
     seed: int,
     threads: int,
     scratch: Path,
-) -> int:
-    """How many of the views there is any hope for that features link them with each other.
+) -> Sounding:
+    """Ask how many views features may link.
 
     Args:
         grays, valid: N images [H, W] uint8 and their masks.
@@ -66,4 +78,6 @@ def linked_at_most(
         correspondences=dict(sorted(found.items())),
     )
     links = Solver(given, options, pixel, seed, threads, scratch).links()
-    return max(Counter(groups(links, len(grays))).values())
+    whole = all(few is gray for (few, _), gray in zip(small, grays, strict=True))
+    linked = max(Counter(groups(links, len(grays))).values())
+    return Sounding(linked, features if whole else None)
