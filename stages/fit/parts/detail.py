@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 #: share of the steps at full size by which Gaussians are split last: the rest lets them settle
 SETTLED = 0.6
+#: room for more, as a share of all that there may be, below which a split is not worth its time
+WORTH = 0.05
 
 
 class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")):
@@ -47,9 +49,9 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         detail_rounds: AutoInt = automatic({5: 2, 6: 0}, held=2)
         """and so many times more at full size"""
         # more between few views gains nothing and costs time; from six on, textured scenes use it
-        detail_density: AutoFloat = automatic({5: 0.3, 6: 0.6}, held=0.4, ge=None, gt=0)
-        """there are at most so many Gaussians for each pixel of a photograph (where there are
-        rounds: half of that the first time, all of it the last); the largest errors come first"""
+        detail_density: AutoFloat = automatic({5: 0.3, 6: 0.6}, ge=None, gt=0)
+        """there are at most so many Gaussians for each pixel of a photograph; the largest errors
+        come first"""
         detail_noise: Annotated[float, Field(ge=0)] = 1.5
         """an error counts above so many times the photograph's own noise"""
         # between few views that are close to each other, more Gaussians for what hardly shows cost
@@ -64,11 +66,8 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         self.added = 0
 
     def begin(self, fit: Trainer) -> None:
-        times = self._times(fit)
-        if fit.iteration in times:
-            share = (1 + (times.index(fit.iteration) + 1) / len(times)) / 2
-            first = fit.reduction(fit.iteration + 1)
-            self._split(fit, first, share if self.settings.detail_rounds else 1.0)
+        if fit.iteration in self._times(fit):
+            self._split(fit, fit.reduction(fit.iteration + 1))
 
     def _times(self, fit: Trainer) -> list[int]:
         """The iterations after which Gaussians are split."""
@@ -79,21 +78,21 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         step = SETTLED * (fit.iterations - coarse) / max(rounds, 1)
         return sorted({*grown, *(round(coarse + step * (k + 1)) for k in range(rounds))})
 
-    def _split(self, fit: Trainer, factor: int, share: float) -> None:
+    def _split(self, fit: Trainer, factor: int) -> None:
         s: Any = self.settings
+        pixels = max(target[1].width * target[1].height for target in fit.targets)
+        most = int(s.detail_density * pixels)
+        if most - len(fit.packed) < WORTH * most:
+            return
         excess, area, seen = unexplained(fit, factor, s.detail_noise, s.detail_error)
         rows = np.flatnonzero(seen >= s.final_prune_contribution)
-        if len(rows) < len(seen):
+        if 0 < len(rows) < len(seen):
             # what hides behind the others takes time, and the places of those that show
             fit.replace(np.ascontiguousarray(fit.packed[rows]), rows, np.zeros(len(rows), bool))
             excess, area = excess[rows], area[rows]
-        pixels = max(target[1].width * target[1].height for target in fit.targets)
-        room = int(share * s.detail_density * pixels) - len(fit.packed)
-        if room <= 0:
-            return
         axes = numerics.detail.wide_axes(fit.packed, self._pixel(fit, factor), s.detail_size)
         wanted = (excess > 0) & (area > 0)
-        axes = numerics.detail.within(axes & wanted[:, None], excess, room)
+        axes = numerics.detail.within(axes & wanted[:, None], excess, most - len(fit.packed))
         if not axes.any():
             return
         packed, source, fresh = numerics.detail.divide(fit.packed, axes)
