@@ -82,10 +82,10 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         s: Any = self.settings
         pixels = max(target[1].width * target[1].height for target in fit.targets)
         most = int(s.detail_density * pixels)
-        if most - len(fit.packed) < WORTH * most:
-            return
         excess, area, seen = unexplained(fit, factor, s.detail_noise, s.detail_error)
         rows = np.flatnonzero(seen >= s.final_prune_contribution)
+        if most - len(rows) < WORTH * most:
+            return
         if 0 < len(rows) < len(seen):
             # what hides behind the others takes time, and the places of those that show
             fit.replace(np.ascontiguousarray(fit.packed[rows]), rows, np.zeros(len(rows), bool))
