@@ -44,7 +44,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         """split Gaussians where the photographs show more than they do, each time the images get
         larger"""
         # three photographs of a street gain 3 dB and .2 of their sharpness by it, three real ones
-        # of teeth .1 of it with as many Gaussians; unseen views stay as they are. Twelve views,
+        # of teeth .1 of it with hardly more Gaussians; unseen views stay. Twelve views,
         # which densification serves, gain nothing
         detail_rounds: AutoInt = automatic({5: 2, 6: 0}, held=2)
         """and so many times more at full size"""
