@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
 
 #: share of the steps at full size by which Gaussians are split last: the rest lets them settle
-SETTLED = 0.6
+LAST = 0.6
 #: room for more, as a share of all that there may be, below which a split is not worth its time
 WORTH = 0.05
 
@@ -75,7 +75,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         coarse = s.coarse_fraction * fit.iterations if count else 0.0
         grown = [k for k in range(1, fit.iterations) if fit.reduction(k + 1) < fit.reduction(k)]
         rounds = s.detail_rounds
-        step = SETTLED * (fit.iterations - coarse) / max(rounds, 1)
+        step = LAST * (fit.iterations - coarse) / max(rounds, 1)
         return sorted({*grown, *(round(coarse + step * (k + 1)) for k in range(rounds))})
 
     def _split(self, fit: Trainer, factor: int) -> None:
