@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from stages.fit.config import FitConfig, FitSettings, resolve
+from stages.fit.inputs.scene import prepare
 from stages.fit.numerics.detail import APART, SHRINK, divide, fine, wide_axes, within
 from stages.fit.parts.detail import Detail
 from stages.fit.parts.start import coarse_factors, reduction
+from tests.stages.fit_case import case
 
 
 def packed(count: int) -> np.ndarray:
@@ -123,3 +125,43 @@ def test_a_start_from_more_points_for_larger_pictures() -> None:
     )
     assert large == 2 * small
     assert resolve(FitConfig(initial_points=77), 3, 0, True, 10**6).initial_points == 77
+
+
+def test_what_lacks_detail_is_split_and_what_hides_goes() -> None:
+    """Stripes on the left ask for finer Gaussians, a shade that is off on the right does not."""
+    views, cameras, points = case()
+    # a sheet without gaps
+    wanted = FitConfig(detail_density=5.0, detail_error=0.02, initial_scale=1.5)
+    settings = resolve(wanted, 3, 0)
+    scene = prepare(views.views, cameras.cameras, points, None, settings)
+    fit = scene.trainer(settings, False)
+    middle = np.argsort(np.abs(fit.packed[:, :2]).max(1))[:40]
+    hidden = fit.packed[middle].copy()
+    hidden[:, 2] += 0.2  # behind the sheet for all of the cameras
+    fit.packed = np.concatenate([fit.packed, hidden])
+    fit.adam.select(np.arange(len(fit.packed)) % 3000, np.zeros(len(fit.packed), bool))
+    for part in fit.parts:
+        part.select(np.arange(len(fit.packed)) % 3000, np.zeros(len(fit.packed), bool))
+    for view, target in enumerate(fit.targets):
+        shown = fit.composited(view, fit.render(view))
+        width = shown.shape[2]
+        shown[:, :, : width // 2] += np.where(np.arange(width // 2) % 2, 0.2, -0.2)
+        shown[:, :, width // 2 :] += 0.2
+        target[1].colour.target[:] = shown
+    before = fit.packed.copy()
+    source = np.arange(len(before))
+    replaced = fit.replace
+
+    def followed(packed: np.ndarray, rows: np.ndarray, fresh: np.ndarray) -> None:
+        nonlocal source
+        source = source[rows]
+        replaced(packed, rows, fresh)
+
+    fit.replace = followed  # type: ignore[method-assign]
+    part = fit.find(Detail)
+    assert part is not None
+    part._split(fit, 1)
+    counts = np.bincount(source, minlength=len(before))
+    assert not counts[-40:].any() and (counts[middle] > 0).mean() > 0.9
+    left, right = (counts[:-40][side] for side in (before[:-40, 0] < -0.1, before[:-40, 0] > 0.1))
+    assert (left > 1).mean() > 0.5 and (right > 1).mean() < 0.05
