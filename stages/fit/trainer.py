@@ -283,8 +283,9 @@ class Trainer:
                 view = self.poses.held
                 image = self.composited(view, self.render(view))
                 write_preview(diary, now, self.targets[view][1].colour.target, image)
-            due = (now % s.checkpoint_every == 0 or last) and np.isfinite(self.packed).all()
-            if checkpoint is not None and due:
+            # what follows the last step takes less time than its checkpoint would save
+            due = now % s.checkpoint_every == 0 and not last
+            if checkpoint is not None and due and np.isfinite(self.packed).all():
                 self.save(checkpoint)
         if not np.isfinite(self.packed).all():
             raise self.diverged("some Gaussians are not finite")

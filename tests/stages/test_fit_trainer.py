@@ -70,9 +70,9 @@ def test_a_stopped_fit_resumes_to_the_same_bytes_with_any_number_of_threads(tmp_
 @pytest.mark.parametrize("damage", ["truncate", "garbage", "other"])
 def test_a_checkpoint_that_cannot_be_used_is_ignored(tmp_path, damage: str) -> None:
     views, cameras, points = case()
-    whole = context(tmp_path / "a", views, cameras, points, iterations=20)
+    whole = context(tmp_path / "a", views, cameras, points, iterations=20, checkpoint_every=7)
     FitStage().run(whole)
-    other = context(tmp_path / "b", views, cameras, points, iterations=30)
+    other = context(tmp_path / "b", views, cameras, points, iterations=30, checkpoint_every=7)
     if damage == "other":
         FitStage().run(other)  # leaves a checkpoint of another fit
     else:

@@ -66,33 +66,32 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         self.added = 0
 
     def begin(self, fit: Trainer) -> None:
-        if fit.iteration in self._times(fit):
+        if self._due(fit):
             self._split(fit, fit.reduction(fit.iteration + 1))
 
-    def _times(self, fit: Trainer) -> list[int]:
-        """The iterations after which Gaussians are split."""
-        s, count = self.settings, len(coarse_factors(self.settings))
-        coarse = s.coarse_fraction * fit.iterations if count else 0.0
-        grown = [k for k in range(1, fit.iterations) if fit.reduction(k + 1) < fit.reduction(k)]
-        rounds = s.detail_rounds
-        step = LAST * (fit.iterations - coarse) / max(rounds, 1)
-        return sorted({*grown, *(round(coarse + step * (k + 1)) for k in range(rounds))})
+    def _due(self, fit: Trainer) -> bool:
+        """Whether images get larger now, or it is time for a further round at full size."""
+        s, now = self.settings, fit.iteration
+        coarse = s.coarse_fraction * fit.iterations if coarse_factors(s) else 0.0
+        step = LAST * (fit.iterations - coarse) / max(s.detail_rounds, 1)
+        rounds = (round(coarse + step * (k + 1)) for k in range(s.detail_rounds))
+        return now > 0 and (fit.reduction(now + 1) < fit.reduction(now) or now in rounds)
 
     def _split(self, fit: Trainer, factor: int) -> None:
         s: Any = self.settings
         pixels = max(target[1].width * target[1].height for target in fit.targets)
         most = int(s.detail_density * pixels)
-        excess, area, seen = unexplained(fit, factor, s.detail_noise, s.detail_error)
+        excess, seen = unexplained(fit, factor, s.detail_noise, s.detail_error)
         rows = np.flatnonzero(seen >= s.final_prune_contribution)
         if most - len(rows) < WORTH * most:
             return
         if 0 < len(rows) < len(seen):
             # what hides behind the others takes time, and the places of those that show
             fit.replace(np.ascontiguousarray(fit.packed[rows]), rows, np.zeros(len(rows), bool))
-            excess, area = excess[rows], area[rows]
+            excess = excess[rows]
         axes = numerics.detail.wide_axes(fit.packed, self._pixel(fit, factor), s.detail_size)
-        wanted = (excess > 0) & (area > 0)
-        axes = numerics.detail.within(axes & wanted[:, None], excess, most - len(fit.packed))
+        wanted = (excess > 0)[:, None]
+        axes = numerics.detail.within(axes & wanted, excess, most - len(fit.packed))
         if not axes.any():
             return
         packed, source, fresh = numerics.detail.divide(fit.packed, axes)
@@ -118,9 +117,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         return {"split_for_detail": self.added}
 
 
-def unexplained(
-    fit: Trainer, factor: int, times: float, least: float
-) -> tuple[Array, Array, Array]:
+def unexplained(fit: Trainer, factor: int, times: float, least: float) -> tuple[Array, Array]:
     """[N] fine squared error beyond the photographs' noise that Gaussians colour, and their area.
 
     Args:
@@ -129,10 +126,10 @@ def unexplained(
         times, least: errors count above this many standard deviations of the noise, and above this.
 
     Returns:
-        Excess and area: sums over the pixels of all views, weighted by what a Gaussian contributes
-        to each. And the largest area in a single view, in pixels at full size.
+        The error: a sum over the pixels of all views, weighted by what a Gaussian contributes to
+        each. And the largest area that it colours in a single view, in pixels at full size.
     """
-    excess, area, seen = np.zeros((3, len(fit.packed)))
+    excess, seen = np.zeros((2, len(fit.packed)))
     for view, target in enumerate(fit.targets):
         colour = target[factor].colour
         rendering, error = fit.missing(view, factor)
@@ -143,8 +140,6 @@ def unexplained(
         planes[0] = colour.mask
         planes[1] = ((fine * fine).mean(0) - np.float32(noise * noise)) * colour.mask
         gradients = rendering.backward(planes, np.zeros_like(rendering.transmittance))
-        here = gradients.features[:, 0]
-        area += here
-        seen = np.maximum(seen, factor * factor * here)
+        seen = np.maximum(seen, factor * factor * gradients.features[:, 0])
         excess += gradients.features[:, 1]
-    return excess, area, seen
+    return excess, seen
