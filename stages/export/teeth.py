@@ -217,9 +217,14 @@ def _tooth(crowns: Sequence[SeenCrown]) -> dict[str, Any]:
 def joint_centre(crowns: Sequence[SeenCrown]) -> tuple[Array | None, float | None]:
     """[3] mean of a tooth's centres by the pixels that show it, and how far they lie from it.
 
-    The latter is None with fewer than two centres, both with none.
+    Where two crowns of a photograph carry the number, one is another tooth: the surer one counts.
+    The distance is None with fewer than two centres, both with none.
     """
-    known = [crown for crown in crowns if crown.centre is not None]
+    surest: dict[str, SeenCrown] = {}
+    for crown in sorted(crowns, key=lambda crown: (crown.doubt, -crown.pixels)):
+        if crown.centre is not None:
+            surest.setdefault(crown.photograph, crown)
+    known = [crown for crown in crowns if surest.get(crown.photograph) is crown]
     if not known:
         return None, None
     centres = np.array([crown.centre for crown in known])

@@ -205,15 +205,19 @@ def test_a_crown_without_depth_has_no_place() -> None:
 
 
 def test_centres_count_by_the_pixels_that_show_the_crown() -> None:
-    def seen(x, pixels):
+    def seen(photograph, x, pixels, doubt=0.1):
         centre = None if x is None else np.array([x, 0.0, 0])
-        return SeenCrown("000", 11, 0.1, np.zeros((3, 2)), centre, pixels)
+        return SeenCrown(photograph, 11, doubt, np.zeros((3, 2)), centre, pixels)
 
-    centre, spread = joint_centre([seen(0.0, 300), seen(4.0, 100), seen(None, 2)])
+    first, second = seen("000", 0.0, 300), seen("001", 4.0, 100)
+    centre, spread = joint_centre([first, second, seen("002", None, 2)])
     np.testing.assert_allclose(centre, [1, 0, 0])
     assert spread == pytest.approx(3)
-    assert joint_centre([seen(2.0, 9)])[1] is None
-    assert joint_centre([seen(None, 0)]) == (None, None)
+    assert joint_centre([seen("000", 2.0, 9)])[1] is None
+    assert joint_centre([seen("000", None, 0)]) == (None, None)
+    # another crown of the same photograph that carries the number is another tooth
+    centre, _ = joint_centre([seen("000", 9.0, 500, 0.6), first, second])
+    np.testing.assert_allclose(centre, [1, 0, 0])
 
 
 @pytest.mark.parametrize("turned", [False, True])
