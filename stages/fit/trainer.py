@@ -283,7 +283,8 @@ class Trainer:
                 view = self.poses.held
                 image = self.composited(view, self.render(view))
                 write_preview(diary, now, self.targets[view][1].colour.target, image)
-            # what follows the last step takes less time than its checkpoint would save
+            # a fit that is killed after its last step repeats those since the last checkpoint; all
+            # others are spared the time to write one more
             due = now % s.checkpoint_every == 0 and not last
             if checkpoint is not None and due and np.isfinite(self.packed).all():
                 self.save(checkpoint)

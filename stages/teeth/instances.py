@@ -114,7 +114,7 @@ def find_crowns(answer: Answer) -> list[Found]:
 
 
 def _sizes_and_scores(labels: Labels, share: Array, inside: Map) -> tuple[Array, Array]:
-    """Area in pixels, and score 0..1, of regions 1, 2, ..."""
+    """[n] area in pixels, and [n] score 0..1, of regions 1..n."""
     numbers = np.arange(1, int(labels.max()) + 1)
     areas = ndimage.sum_labels(np.ones(labels.shape), labels, numbers)
     peaks = np.asarray(ndimage.maximum(inside, labels, numbers), np.float64)
@@ -123,7 +123,7 @@ def _sizes_and_scores(labels: Labels, share: Array, inside: Map) -> tuple[Array,
 
 
 def _are_crowns(areas: Array, scores: Array) -> npt.NDArray[np.bool_]:
-    """Which regions are large and sure enough to be crowns."""
+    """[n] which regions are large and sure enough to be crowns, by their areas and scores [n]."""
     least = max(LEAST_PIXELS, LEAST_AREA * float(np.median(areas)))
     return np.asarray((areas >= least) & (scores >= LEAST_SCORE))
 
@@ -195,7 +195,15 @@ def _merged(labels: Labels, smooth: Map, count: int) -> Labels:
 
 
 def _rejoined(labels: Labels, crowns: npt.NDArray[np.bool_], answer: Answer) -> Labels:
-    """Crowns that touch and are surely the same molar are one: a groove parted its cusps."""
+    """[H, W] labels once crowns that touch and are surely the same molar are one.
+
+    A groove between its cusps can look like the border between two teeth.
+
+    Args:
+        labels: [H, W] regions 1..n, 0: none.
+        crowns: [n] which of them are crowns by themselves; others join none.
+        answer: what the network says, at 1 / `_FINER` of that size.
+    """
     numbers = np.arange(1, int(labels.max()) + 1)
     small = labels[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER]
     weight = np.maximum(ndimage.sum_labels(answer.inside, small, numbers), 1e-9)
