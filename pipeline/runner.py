@@ -19,7 +19,7 @@ from pipeline.planning import (
     resolve_chain,
 )
 from pipeline.process import signals
-from pipeline.process.native import one_blas_thread
+from pipeline.process.native import one_blas_thread, return_free_memory
 from pipeline.running.context import RunContext
 from pipeline.running.failing import explained
 from pipeline.running.outcomes import RunSummary, StageOutcome, figures_of
@@ -223,6 +223,7 @@ class Runner:
             context = RunContext(planned, self.config, self.store, folder, self.reporter)
             with Measurement() as measurement, self._profiled(name), one_blas_thread():
                 stage.run(context)
+            return_free_memory()
             missing = [kind for kind in stage.provides if kind not in context.outputs]
             if missing:
                 raise StageError(f"The stage '{name}' ended without writing {', '.join(missing)}.")

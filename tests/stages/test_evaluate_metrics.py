@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from stages.evaluate.images import rows
+from stages.evaluate.images.flip import flip_map
 from stages.evaluate.images.metrics import detail, psnr, ssim, ssim_map
 from stages.evaluate.images.pictures import GAP, comparison, error_map, spread
 from stages.evaluate.images.score import LARGEST_PSNR, score_view, summary_of
@@ -24,6 +26,19 @@ def noisy_pair(height: int = 61, width: int = 83, level: float = 20) -> tuple[Im
     truth = np.clip(base + rng.normal(0, 12, (height, width, 3)), 0, 255).astype(np.uint8)
     image = np.clip(truth + rng.normal(0, level, truth.shape), 0, 255).astype(np.uint8)
     return image, truth
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("height", [rows.ROWS - 1, rows.ROWS, rows.ROWS + 1, 2 * rows.ROWS + 9])
+def test_strips_of_a_picture_give_what_the_whole_does(
+    height: int, masked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, truth = noisy_pair(height)
+    mask = np.random.default_rng(1).random(truth.shape[:2]) < 0.7 if masked else None
+    strips = ssim_map(image, truth, mask), flip_map(image, truth)
+    monkeypatch.setattr(rows, "ROWS", height)
+    np.testing.assert_array_equal(strips[0], ssim_map(image, truth, mask))
+    np.testing.assert_allclose(strips[1], flip_map(image, truth), atol=1e-6)
 
 
 def test_psnr_of_a_known_error() -> None:

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from stages.evaluate.images.rows import by_rows
+
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
@@ -23,6 +25,13 @@ PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 #: Width of the features that are looked for, degrees.
 FEATURE_WIDTH = 0.082
+#: What lies farther off than this does not touch a pixel, pixels: the wider of the two filters.
+REACH = math.ceil(
+    3 * PIXELS_PER_DEGREE * max(
+        FEATURE_WIDTH / 2,
+        *(math.sqrt(width / (2 * math.pi**2)) for terms in SENSITIVITY for _, width in terms),
+    )
+)  # fmt: skip
 #: Exponents of colour and feature differences, and how colour differences are spread over 0..1.
 COLOR_EXPONENT, FEATURE_EXPONENT = 0.7, 0.5
 SHARE_OF_LARGEST, SPREAD_TO = 0.4, 0.95
@@ -55,6 +64,10 @@ def flip_map(image: Image, truth: Image) -> Floats:
     Returns:
         [H, W] float32 in 0..1; the usual figure is its mean.
     """
+    return by_rows(_flip, REACH, image, truth)
+
+
+def _flip(image: Image, truth: Image) -> Floats:
     colors, edges, spots = zip(*map(_seen, (truth, image)), strict=True)
     color = _spread(_distance(*colors))
     feature = np.maximum(np.abs(edges[0] - edges[1]), np.abs(spots[0] - spots[1]))

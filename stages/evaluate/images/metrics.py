@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from stages.evaluate.images.rows import by_rows
+
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
@@ -108,8 +110,16 @@ def ssim_map(image: Image, truth: Image, mask: Mask | None = None) -> Array:
 
     Returns:
         [H, W, 3] or [H, W] float64; outside the mask the values mean nothing.
+
+    Raises:
+        ValueError: the shapes differ, or the mask has no pixel.
     """
-    first, second = _pair(image, truth, mask)
+    _check(image, truth, mask)
+    return by_rows(_ssim, SSIM_WINDOW // 2, image, truth, mask)
+
+
+def _ssim(image: Image, truth: Image, mask: Mask | None) -> Array:
+    first, second = _unit(image), _unit(truth)
     if mask is None:
         smooth = _window
     else:
@@ -137,10 +147,19 @@ def _window(values: Array) -> Array:
 
 
 def _pair(image: Image, truth: Image, mask: Mask | None) -> tuple[Array, Array]:
+    _check(image, truth, mask)
+    return _unit(image), _unit(truth)
+
+
+def _unit(image: Image) -> Array:
+    """Values of 8 bits as 0..1."""
+    return image.astype(np.float64) / 255
+
+
+def _check(image: Image, truth: Image, mask: Mask | None) -> None:
     if image.dtype != np.uint8 or truth.dtype != np.uint8:
         raise ValueError(f"metrics are of 8-bit images, not of {image.dtype} and {truth.dtype}")
     if image.shape != truth.shape:
         raise ValueError(f"images of different shape: {image.shape} and {truth.shape}")
     if mask is not None and (mask.shape != image.shape[:2] or not mask.any()):
         raise ValueError(f"the mask {mask.shape} fits no image {image.shape}, or is empty")
-    return image.astype(np.float64) / 255, truth.astype(np.float64) / 255

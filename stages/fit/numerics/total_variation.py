@@ -28,6 +28,8 @@ from stages.splatting.threads import KERNELS, workers
 
 F = np.float32
 CHUNK = 256
+#: So many positions ask for their neighbours in one go.
+QUERIES = 32768
 
 
 @inlined
@@ -173,9 +175,13 @@ class TotalVariation:
         """The neighbours; `starts` is set."""
         number = len(positions)
         count = min(self.count, number - 1)
-        _, found = cKDTree(positions).query(positions, k=count + 1, workers=workers())
+        tree, threads = cKDTree(positions), workers()
+        found = np.empty((number, count + 1), np.int32)
+        for start in range(0, number, QUERIES):  # what the tree returns is four times as large
+            some = positions[start : start + QUERIES]
+            found[start : start + QUERIES] = tree.query(some, k=count + 1, workers=threads)[1]
         with KERNELS:
-            neighbours, self.starts = _both_ways(found.astype(np.int32))
+            neighbours, self.starts = _both_ways(found)
         return neighbours
 
     def forget(self) -> None:
