@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import Jaw, permanent_of, teeth_of
+from pipeline.artifacts.teeth import Crown
 
 Array = npt.NDArray[np.float64]
 Labels = tuple[int, ...]
@@ -20,6 +21,8 @@ Labels = tuple[int, ...]
 #: Positions along a row, patient's right to left, and the label of a crown that is no tooth.
 POSITIONS = 14
 NO_TOOTH = -1
+#: Log probability of a position where a person has said another.
+SAID_OTHERWISE = -60.0
 
 
 @dataclass(frozen=True)
@@ -53,11 +56,32 @@ def position_evidence(numbers: Mapping[int, float], jaw: Jaw, options: ChainOpti
     return np.asarray(np.log((1 - options.floor * POSITIONS) * share / share.sum() + options.floor))
 
 
-def row_probabilities(evidence: Array, options: ChainOptions) -> tuple[Array, float]:
+def said(crown: Crown) -> bool:
+    """Whether a person has said the crown's number."""
+    return crown.doubt == 0 and crown.number != 0
+
+
+def believed(crown: Crown) -> Mapping[int, float]:
+    """FDI number -> probability: by its looks, or what a person has said."""
+    return {crown.number: 1.0} if said(crown) else crown.numbers
+
+
+def crown_evidence(crown: Crown, jaw: Jaw, options: ChainOptions) -> Array:
+    """[14] log probability of each position; a person's word leaves no other."""
+    evidence = position_evidence(believed(crown), jaw, options)
+    if said(crown):
+        evidence = np.where(evidence < evidence.max(), SAID_OTHERWISE, 0.0)
+    return np.asarray(evidence)
+
+
+def row_probabilities(
+    evidence: Array, options: ChainOptions, weights: Array | None = None
+) -> tuple[Array, float]:
     """Probabilities of each crown's position in its row.
 
     Args:
         evidence: [n, 14] log probability of each position by looks, crowns from left to right.
+        weights: [n] as how many crowns each counts in being no tooth; None: as one.
 
     Returns:
         [n, 15] probabilities of the positions and (last) of being no tooth of this row; and the
@@ -72,26 +96,26 @@ def row_probabilities(evidence: Array, options: ChainOptions) -> tuple[Array, fl
     for a in range(states):
         for b in range(a + 1, states):
             step[a, b] = 0.0 if a == 0 else -options.skipped * (b - a - 1)
-    stay = -options.none - np.log(POSITIONS)
+    stay = -(options.none + np.log(POSITIONS)) * (np.ones(count) if weights is None else weights)
     forward = np.full((count + 1, states), -np.inf)
     forward[0, 0] = 0.0
     for k in range(count):
         moved = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)
         moved[1:] += evidence[k]
-        forward[k + 1] = np.logaddexp(moved, forward[k] + stay)
+        forward[k + 1] = np.logaddexp(moved, forward[k] + stay[k])
     backward = np.zeros((count + 1, states))
     for k in range(count - 1, -1, -1):
         ahead = backward[k + 1].copy()
         ahead[1:] += evidence[k]
         taken = np.logaddexp.reduce(step + ahead[None], axis=1)
-        backward[k] = np.logaddexp(taken, backward[k + 1] + stay)
+        backward[k] = np.logaddexp(taken, backward[k + 1] + stay[k])
     total = float(backward[0, 0])
     result = np.zeros((count, POSITIONS + 1))
     for k in range(count):
         arrive = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)[1:]
         result[k, :POSITIONS] = np.exp(arrive + evidence[k] + backward[k + 1][1:] - total)
         result[k, POSITIONS] = np.exp(
-            np.logaddexp.reduce(forward[k] + stay + backward[k + 1]) - total
+            np.logaddexp.reduce(forward[k] + stay[k] + backward[k + 1]) - total
         )
     return result, total
 

@@ -95,5 +95,41 @@ def resized_dentition(dentition: Dentition, size: tuple[int, int]) -> Dentition:
     )
 
 
+def outline_in_view(outline: Array, size: tuple[int, int], view: View) -> Array:
+    """An outline [K, 2] as the teeth were read, in pixels of the view as it is now.
+
+    Its image may have been undistorted after the teeth were read (`View.lens_taken_out`), or be of
+    another size.
+
+    Args:
+        outline: pixels of the image that the teeth were read from.
+        size: width and height of that image.
+        view: as it is now.
+    """
+    scaled = outline * (np.array([view.width, view.height]) / np.array(size))
+    if not view.lens_taken_out:
+        return np.asarray(scaled, np.float64)
+    from pipeline.geometry.models.colmap import quiet_pycolmap
+    from pipeline.geometry.models.known_cameras import (
+        KnownCamera,
+        pinhole_camera,
+        working_pixels_from_lens,
+    )
+
+    model, width, height, *parameters = view.lens_taken_out.split()
+    lens = quiet_pycolmap().Camera(
+        model=model, width=int(width), height=int(height),
+        params=[float(value) for value in parameters],
+    )  # fmt: skip
+    known = KnownCamera(view.name, lens, np.eye(4))
+    camera = pinhole_camera(view, known)
+    lens_from_working = np.linalg.inv(working_pixels_from_lens(view, known, "teeth.json"))
+    pixels = scaled @ lens_from_working[:2, :2].T + lens_from_working[:2, 2]
+    rays = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
+    # `pinhole_camera` turns the lens's axes to those of the upright image.
+    straight, _ = camera.project(rays)
+    return straight
+
+
 def _shrunk(pixels: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray[Any]:
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))

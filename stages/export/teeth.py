@@ -15,6 +15,7 @@ from pipeline.artifacts.dental.fdi import is_primary, is_upper, universal_number
 from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth, filled
 from pipeline.artifacts.views import View, Views
+from stages.dentition.working import outline_in_view
 from stages.splatting.rendering import RenderedView
 
 Array = npt.NDArray[np.float64]
@@ -124,7 +125,7 @@ def _seen_crowns(
     for crown in dentition.all_crowns:
         if not crown.number or len(crown.outline) < 3:
             continue
-        outline = exported_outline(crown.outline, dentition.size, view)
+        outline = outline_in_view(crown.outline, dentition.size, view)
         inside = known & filled((replace(crown, outline=outline),), size)
         pixels = int(inside.sum())
         centre = np.median(world[inside], axis=0) if pixels >= LEAST_PIXELS else None
@@ -151,42 +152,6 @@ def _seen_size(
     unit = depth / camera.fx * view.width / dentition.size[0]
     occlusal = dentition.kind in ("upper", "lower")
     return crown.width * unit, None if occlusal else crown.height * unit
-
-
-def exported_outline(outline: Array, size: tuple[int, int], view: View) -> Array:
-    """An outline [K, 2] as the teeth were read, in pixels of the image that is exported.
-
-    The image may have been undistorted after the teeth were read (`View.lens_taken_out`), or be of
-    another size.
-
-    Args:
-        outline: pixels of the image that the teeth were read from.
-        size: width and height of that image.
-        view: as it is exported.
-    """
-    scaled = outline * (np.array([view.width, view.height]) / np.array(size))
-    if not view.lens_taken_out:
-        return np.asarray(scaled, np.float64)
-    from pipeline.geometry.models.colmap import quiet_pycolmap
-    from pipeline.geometry.models.known_cameras import (
-        KnownCamera,
-        pinhole_camera,
-        working_pixels_from_lens,
-    )
-
-    model, width, height, *parameters = view.lens_taken_out.split()
-    lens = quiet_pycolmap().Camera(
-        model=model, width=int(width), height=int(height),
-        params=[float(value) for value in parameters],
-    )  # fmt: skip
-    known = KnownCamera(view.name, lens, np.eye(4))
-    camera = pinhole_camera(view, known)
-    lens_from_working = np.linalg.inv(working_pixels_from_lens(view, known, "teeth.json"))
-    pixels = scaled @ lens_from_working[:2, :2].T + lens_from_working[:2, 2]
-    rays = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
-    # `pinhole_camera` turns the lens's axes to those of the upright image.
-    straight, _ = camera.project(rays)
-    return straight
 
 
 def _tooth(crowns: Sequence[SeenCrown]) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def save_matches(context: StageContext, links: Links, most: int) -> None:
 
 def save_all(
     context: StageContext, views: Views, placed: tuple[View, ...], cameras: Cameras,
-    depths: list[Map], points: Points, pairs: list[PointmapPair],
+    depths: list[Map], points: Points, pairs: list[PointmapPair], teeth: Teeth | None = None,
 ) -> None:  # fmt: skip
     """Write the outputs, with the scale that is known.
 
@@ -103,11 +103,16 @@ def save_all(
         views: all that the stage was given.
         placed: the views of the cameras; written too where their images or masks have changed.
         depths: z-depth [H, W] of each, to measure in.
+        teeth: numbered by what placed the views; None: what was read is numbered by the depths.
     """
     config: InitConfig = context.config
     # points of a model alone have no depth to see a tooth at
-    if cameras.mouth_from_world is None and context.has("teeth") and len(depths) == len(placed):
-        cameras = _with_mouth(context.load("teeth"), placed, cameras, depths)
+    if teeth is None and context.has("teeth") and len(depths) == len(placed):
+        teeth = _agreed(context, views, placed, cameras, depths)
+    if teeth is not None:
+        context.save(teeth)
+        if cameras.mouth_from_world is None and len(depths) == len(placed):
+            cameras = _with_mouth(teeth, placed, cameras, depths)
     if config.length.mm is not None:
         cameras = _scaled(context, views, placed, cameras, depths)
     context.save(cameras)
@@ -125,6 +130,29 @@ def save_all(
         views_registered=len(cameras), views_total=len(views),
         focal=round(float(np.median(focals)), 4), points=len(points),
     )  # fmt: skip
+
+
+def _agreed(
+    context: StageContext, views: Views, placed: tuple[View, ...], cameras: Cameras,
+    depths: list[Map],
+) -> Teeth | None:  # fmt: skip
+    """The teeth with the numbers that the placed photographs agree on; None: there are none."""
+    from stages.dentition.joint_numbers import agreed_numbers
+    from stages.dentition.overlay import labelled_overlay
+    from stages.init.dental.read import labelled_teeth
+
+    read = labelled_teeth(context, views)
+    if not read.chosen:
+        return None
+    teeth = agreed_numbers(read, placed, cameras.cameras, depths)
+    seen, by_name = {view.name for view in placed}, views.by_name()
+    pictures = {
+        dentition.name: labelled_overlay(by_name[dentition.name].image, dentition)
+        for dentition in teeth.chosen if dentition.name in seen
+    }  # fmt: skip
+    numbers = {c.number for view in teeth.chosen if view.name in seen for c in view.all_crowns}
+    context.summarize(teeth=len(numbers - {0}))
+    return replace(teeth, pictures={**read.pictures, **pictures})
 
 
 def _with_mouth(

@@ -14,11 +14,11 @@ class TeethConfig(StageConfig):
 
     method: Literal["auto", "reader", "none"] = Field(
         "auto",
-        description="reader: read every photograph; none: none; auto: read up to `most_views`, and "
-        "leave scenes alone whose first photographs show no teeth",
+        description="reader: read every photograph; none: none; auto: read at most `most_views`, "
+        "and leave scenes alone of which a few show no teeth",
     )
     most_views: int = Field(
-        12, ge=1, le=1000, description="with more photographs than this, auto reads none"
+        12, ge=1, le=1000, description="of more photographs than this, auto reads so many, evenly"
     )
     set_aside: bool = Field(
         True,

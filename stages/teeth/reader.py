@@ -53,7 +53,7 @@ class PhotographReader:
     def shows_teeth(self) -> bool:
         """Is this a case of teeth? One quick look at a few photographs."""
         with self._side_by_side() as map_:
-            votes = list(map_(_has_teeth, _evenly(self._glances, _ASKED)))
+            votes = list(map_(_has_teeth, evenly(self._glances, _ASKED)))
         return bool(votes) and sum(votes) > _SHARE * len(votes)
 
     def read(self, progress: Progress) -> list[Reading]:
@@ -85,7 +85,7 @@ class PhotographReader:
     def _upside_down(self, map_: Map) -> bool:
         """Do the photographs stand on their heads, by some that show both rows of teeth?"""
         upright = [g for g in self._glances if shows_both_rows(g.turned(0)[1])]
-        found = map_(_gain_upside_down, _evenly(upright, _TURNED))
+        found = map_(_gain_upside_down, evenly(upright, _TURNED))
         gains = [gain for gain in found if gain is not None]
         return bool(gains) and float(np.mean(gains)) > _MORE_UPRIGHT
 
@@ -106,7 +106,7 @@ def read_photographs(views: Sequence[View], threads: int, progress: Progress) ->
     return PhotographReader(views, threads).read(progress)
 
 
-def _evenly(items: Sequence[Item], most: int) -> list[Item]:
+def evenly(items: Sequence[Item], most: int) -> list[Item]:
     """At most so many of some items, evenly chosen."""
     if not items:
         return []

@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 6
+    version = 7
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)
@@ -37,19 +37,19 @@ class TeethStage(Stage):
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.dentition.working import resized_dentition, working_view
         from stages.teeth.choose import ChoiceOptions, choose
-        from stages.teeth.reader import PhotographReader
+        from stages.teeth.reader import PhotographReader, evenly
 
         config: TeethConfig = context.config
         views = context.load("views").views
-        working = [working_view(view) for view in views]
+        found = [Dentition(view.name, (view.width, view.height), "none") for view in views]
+        read = list(range(len(views)))
+        if config.method == "auto":  # neighbours in a film show the same teeth
+            read = evenly(read, config.most_views)
+        working = [working_view(views[k]) for k in read]
         reader = PhotographReader(working, context.threads)
-        wanted = config.method != "none" and (
-            config.method == "reader" or (len(views) <= config.most_views and reader.shows_teeth())
-        )
+        wanted = config.method == "reader" or (config.method == "auto" and reader.shows_teeth())
         if not wanted:
-            size = [(view.width, view.height) for view in views]
-            empty = [Dentition(v.name, s, "none") for v, s in zip(views, size, strict=True)]
-            context.save(Teeth(tuple(empty)))
+            context.save(Teeth(tuple(found)))
             context.summarize(photographs_with_teeth=0)
             return
         readings = reader.read(context.progress)
@@ -57,22 +57,20 @@ class TeethStage(Stage):
             config.least_crowns, config.least_extent, config.least_colour, config.same_view,
             config.least_score,
         )  # fmt: skip
-        names = [view.source_name or view.name for view in views]
+        names = [views[k].source_name or views[k].name for k in read]
         images = [view.image for view in working]
-        found = (
+        chosen = (
             choose(readings, images, names, options)
             if config.set_aside
             else [reading.dentition for reading in readings]
         )
-        dentitions = [
-            resized_dentition(dentition, (view.width, view.height))
-            for dentition, view in zip(found, views, strict=True)
-        ]
+        for k, dentition in zip(read, chosen, strict=True):
+            found[k] = resized_dentition(dentition, (views[k].width, views[k].height))
+        dentitions = [found[k] for k in read]
         pictures = {
-            view.name: labelled_overlay(view.image, dentition)
-            for view, dentition in zip(views, dentitions, strict=True)
+            views[k].name: labelled_overlay(views[k].image, found[k]) for k in read
         }
-        teeth = Teeth(tuple(dentitions), pictures)
+        teeth = Teeth(tuple(found), pictures)
         if teeth.chosen:
             for name, dentition in zip(names, dentitions, strict=True):
                 if dentition.set_aside:

@@ -20,10 +20,10 @@ from pipeline.stage import LocalContext
 from stages.export.measuring.teeth_table import teeth_table, tooth_name
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage
+from stages.dentition.working import outline_in_view
 from stages.export.teeth import (
     SeenCrown,
     describe_teeth,
-    exported_outline,
     joint_centre,
     without_names,
 )
@@ -232,7 +232,7 @@ def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
     )
     straight, _ = as_pinhole(view, KnownCamera("000", lens, np.eye(4)))
     outline = np.array([[20.0, 25], [70, 22], [75, 70], [15, 60]])
-    moved = exported_outline(outline, (width, height), straight)
+    moved = outline_in_view(outline, (width, height), straight)
     assert np.abs(moved - outline).max() > 1
     index = (moved - 0.5).astype(np.float32)
     shown = cv2.remap(straight.image, index[None, :, 0], index[None, :, 1], cv2.INTER_LINEAR)
@@ -242,7 +242,7 @@ def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
 
 def test_outlines_follow_an_image_of_another_size() -> None:
     view = View("000", np.zeros((60, 80, 3), np.float32))
-    moved = exported_outline(np.array([[40.0, 30]]), (160, 120), view)
+    moved = outline_in_view(np.array([[40.0, 30]]), (160, 120), view)
     np.testing.assert_allclose(moved, [[20, 15]])
 
 

@@ -196,13 +196,13 @@ def in_frame(camera: Camera, frame: Array) -> Camera:
 def labels_of(dentition, view) -> Labels:  # type: ignore[no-untyped-def]
     """[H, W] FDI number of each pixel of a view, by the outlines of its numbered crowns."""
     from pipeline.artifacts.teeth import filled
-    from stages.export.teeth import exported_outline
+    from stages.dentition.working import outline_in_view
 
     labels = np.zeros((view.height, view.width), np.uint8)
     size = view.width, view.height
     for crown in dentition.all_crowns:
         if crown.number and len(crown.outline) >= 3:
-            outline = exported_outline(crown.outline, dentition.size, view)
+            outline = outline_in_view(crown.outline, dentition.size, view)
             labels[filled((replace(crown, outline=outline),), size)] = crown.number
     return labels
 

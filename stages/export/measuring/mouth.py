@@ -18,7 +18,8 @@ from stages.export.measuring.landmarks import (
     read_landmarks,
 )
 from stages.export.measuring.measures import measure_mouth, mouth_axes
-from stages.export.teeth import LEAST_ALPHA, exported_outline
+from stages.dentition.working import outline_in_view
+from stages.export.teeth import LEAST_ALPHA
 from stages.splatting.rendering import RenderedView
 
 Array = npt.NDArray[np.float64]
@@ -75,14 +76,14 @@ def read_mouth(
 
 
 def exported_dentition(dentition: Dentition, view: View) -> Dentition:
-    """A dentition in pixels of the image that is exported (see `exported_outline`)."""
+    """A dentition in pixels of the image that is exported (see `outline_in_view`)."""
     crowns = dentition.all_crowns
     size = (view.width, view.height)
     if dentition.size == size and not view.lens_taken_out:
         return dentition
     pixels = [landmark_pixels(crown) for crown in crowns]
     if pixels:
-        moved = exported_outline(np.concatenate(pixels), dentition.size, view)
+        moved = outline_in_view(np.concatenate(pixels), dentition.size, view)
         split = np.cumsum([len(points) for points in pixels])[:-1]
         dentition = moved_dentition(dentition, dict(enumerate(np.split(moved, split))))
     return replace(dentition, size=size)

@@ -58,17 +58,17 @@ def from_teeth(context: StageContext, views: Views) -> None:
             progress=context.progress,
         )  # fmt: skip
     except ReconstructionError as doubtful:
-        numbered = doubtful.artifacts.get("teeth")
-        if isinstance(numbered, TeethArtifact):
-            doubtful.artifacts["teeth"] = updated(read, numbered.views)
+        kept = doubtful.artifacts.get("teeth")
+        if isinstance(kept, TeethArtifact):
+            doubtful.artifacts["teeth"] = updated(read, kept.views)
         raise
     for doubt in (
         *teeth.fit.doubts, *in_another_light(names, teeth), *turned_back(names, teeth),
         *misnamed(names, teeth),
     ):  # fmt: skip
         context.warn(doubt)
-    context.save(updated(read, [d for d in teeth.dentitions if d is not None]))
-    _write(context, given, teeth)
+    numbered = updated(read, [d for d in teeth.dentitions if d is not None])
+    _write(context, given, teeth, numbered)
 
 
 def chosen_dentitions(read: TeethArtifact, views: Views) -> list[Dentition | None]:
@@ -121,7 +121,9 @@ def misnamed(names: list[str], teeth: Reconstruction) -> list[str]:
     ]
 
 
-def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
+def _write(
+    context: StageContext, views: Views, teeth: Reconstruction, numbered: TeethArtifact
+) -> None:
     config: InitConfig = context.config
     surface = teeth.surface
     order = [number for number, placed in enumerate(teeth.fit.views) if placed is not None]
@@ -169,7 +171,7 @@ def _write(context: StageContext, views: Views, teeth: Reconstruction) -> None:
     )  # fmt: skip
     save_all(
         context, views, placement.views,
-        replace(placement.placed(), mouth_from_world=mouth), depths, points, pairs,
+        replace(placement.placed(), mouth_from_world=mouth), depths, points, pairs, numbered,
     )  # fmt: skip
     context.save(Pictures(teeth.pictures))
     context.summarize(

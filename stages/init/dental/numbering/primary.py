@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, is_primary, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.dentition.tooth_rows import NO_TOOTH
+from stages.dentition.tooth_rows import NO_TOOTH, believed
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
-from stages.init.dental.numbering.sightings import believed
 from stages.init.dental.template import tooth_at
 
 Array = npt.NDArray[np.float64]

@@ -5,7 +5,6 @@ A label here is a position along the row, 0 (patient's right second molar) to 13
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +13,13 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Point
-from stages.dentition.tooth_rows import NO_TOOTH, ChainOptions, Labels, position_evidence
+from stages.dentition.tooth_rows import (
+    NO_TOOTH,
+    SAID_OTHERWISE,
+    ChainOptions,
+    Labels,
+    crown_evidence,
+)
 from stages.init.dental.cameras.bundle import Sightings
 from stages.init.dental.template import (
     EMBRASURE,
@@ -29,8 +34,6 @@ Array = npt.NDArray[np.float64]
 
 #: How the looks of crowns count.
 LOOKS = ChainOptions()
-#: Log probability of a position where a person has said another.
-SAID_OTHERWISE = -60.0
 #: Place of a primary tooth -> shares in which it is taken for a tooth of that place, the next, and
 #: the next but one.
 TAKEN_FOR = {4: (0.45, 0.35, 0.20), 5: (0.30, 0.45, 0.25)}
@@ -142,24 +145,11 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                 embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
                 embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
                 doubtful=doubtful,
-                looks=np.array([_evidence(crown, jaw) for crown in crowns]).reshape(-1, POSITIONS),
+                looks=np.array([crown_evidence(crown, jaw, LOOKS) for crown in crowns]).reshape(-1, POSITIONS),
                 scores=np.array([crown.score for crown in crowns], np.float64),
             )
         )
     return rows[0], rows[1]
-
-
-def believed(crown: Crown) -> Mapping[int, float]:
-    """FDI number -> probability: by its looks, or what a person has said (doubt 0)."""
-    return {crown.number: 1.0} if crown.doubt == 0 and crown.number else crown.numbers
-
-
-def _evidence(crown: Crown, jaw: Jaw) -> Array:
-    """[14] log probability of each position; a person's word leaves no other."""
-    evidence = position_evidence(believed(crown), jaw, LOOKS)
-    if crown.doubt == 0 and crown.number:
-        evidence = np.where(evidence < evidence.max(), SAID_OTHERWISE, 0.0)
-    return np.asarray(evidence)
 
 
 def as_a_childs(row: SeenRow) -> SeenRow:

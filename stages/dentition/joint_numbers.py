@@ -1,0 +1,281 @@
+"""Numbers that placed photographs agree on.
+
+A photograph by itself counts teeth from what it shows: where a crown is hidden, or read as two, all
+that follow may carry their neighbours' numbers. Once the photographs are placed, the surface says
+which crowns are one tooth; looks of all of them together, and the order that all rows have in
+common, number it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import expit, softmax
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.dental.fdi import JAWS, Jaw, primary_of, teeth_of
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.views import View
+from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike, same_teeth
+from stages.dentition.tooth_rows import (
+    POSITIONS,
+    ChainOptions,
+    believed,
+    crown_evidence,
+    row_probabilities,
+    said,
+)
+
+Array = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+#: Index of a photograph and of a crown among `Dentition.all_crowns` -> number and its doubt.
+Numbers = dict[tuple[int, int], tuple[int, float]]
+
+#: Photographs of one tooth look alike and err together: n of them count as n to this power.
+JOINT_POWER = 0.75
+#: A tooth of which so much lies in another's crowns, in photographs that show it, is a part of that.
+PART = 0.6
+LEAST_SHOWN = 1.0
+#: Weight of the expected places in the order of a row, against what photographs say.
+LOOKS_IN_ORDER = 1e-3
+LEAST_DOUBT = 1e-4
+#: In which all teeth's kinds settle.
+ROUNDS = 20
+#: How the order of a row counts.
+ROWS = ChainOptions()
+#: Number and doubt of what is no tooth.
+NONE = 0, 1.0
+
+
+@dataclass(frozen=True)
+class _Tooth:
+    """One tooth, or what passes for one.
+
+    Attributes:
+        members: indices of its sightings.
+        jaw: of all of them.
+        centre: [3] median of theirs.
+        weight: as how many crowns it counts.
+        evidence: [14] log probability of each position by its looks, times that.
+        primary: log odds of a primary tooth, if it stands in a place that has one, [14].
+    """
+
+    members: list[int]
+    jaw: Jaw
+    centre: Array
+    weight: float
+    evidence: Array
+    primary: Array
+
+
+def agreed_numbers(
+    teeth: Teeth,
+    views: Sequence[View],
+    cameras: Sequence[Camera],
+    depths: Sequence[Map],
+    options: ChainOptions = ROWS,
+) -> Teeth:
+    """The teeth with the numbers that all placed photographs together give their crowns.
+
+    Photographs that are not placed keep theirs, and so do crowns whose depth is unknown. What a
+    person has said (doubt 0) stays, and counts for the same tooth in the other photographs.
+
+    Args:
+        teeth: as each photograph was read by itself.
+        views: the placed photographs.
+        cameras, depths: of each, with z-depth [H, W], 0 where unknown.
+        options: of the rows.
+    """
+    read = {dentition.name: dentition for dentition in teeth.chosen if not dentition.mirrored}
+    dentitions = [read.get(view.name) for view in views]
+    if sum(dentition is not None for dentition in dentitions) < 2:
+        return teeth
+    overlaps = crown_overlaps(views, dentitions, cameras, depths)
+    numbers = _numbers(overlaps, dentitions, options)
+    changed = {
+        dentition.name: _renumbered(dentition, v, numbers, options)
+        for v, dentition in enumerate(dentitions)
+        if dentition is not None
+    }
+    views_read = tuple(changed.get(dentition.name, dentition) for dentition in teeth.views)
+    return replace(teeth, views=views_read, pictures={})
+
+
+def _renumbered(
+    dentition: Dentition, view: int, numbers: Numbers, options: ChainOptions
+) -> Dentition:
+    """A photograph's crowns with the numbers agreed on; the others' by the row that these make."""
+    known = [numbers.get((view, index)) for index in range(len(dentition.all_crowns))]
+    rows, start = {}, 0
+    for jaw in JAWS:
+        crowns = dentition.crowns(jaw)
+        rows[jaw] = _completed(crowns, known[start : start + len(crowns)], jaw, options)
+        start += len(crowns)
+    return replace(dentition, upper=rows["upper"], lower=rows["lower"])
+
+
+def _completed(
+    crowns: Sequence[Crown], known: Sequence[tuple[int, float] | None], jaw: Jaw,
+    options: ChainOptions,
+) -> tuple[Crown, ...]:  # fmt: skip
+    result, row = list(crowns), []
+    for k, (crown, agreed) in enumerate(zip(crowns, known, strict=True)):
+        if agreed is not None and not said(crown):
+            result[k] = replace(crown, number=agreed[0], doubt=agreed[1])
+        number = result[k].number
+        if agreed is None or (number and number not in [result[j].number for j in row]):
+            row.append(k)
+    fixed = [replace(result[k], doubt=0.0) if known[k] else result[k] for k in row]
+    evidence = [crown_evidence(crown, jaw, options) for crown in fixed]
+    shares, _ = row_probabilities(np.array(evidence).reshape(-1, POSITIONS), options)
+    for k, share in zip(row, shares, strict=True):
+        if known[k] is None and not said(crowns[k]):
+            place, number, doubt = int(np.argmax(share)), *NONE
+            if place < POSITIONS:
+                odds = float(_primary(crowns[k], jaw)[place])
+                number, doubt = _number(jaw, place, float(share[place]), odds)
+            result[k] = replace(crowns[k], number=number, doubt=doubt)
+    return tuple(result)
+
+
+def _numbers(
+    overlaps: Overlaps, dentitions: Sequence[Dentition | None], options: ChainOptions
+) -> Numbers:
+    crowns = []
+    for sighting in overlaps.sightings:
+        dentition = dentitions[sighting.view]
+        assert dentition is not None
+        crowns.append(dentition.all_crowns[sighting.index])
+    looks = [softmax(crown_evidence(crown, crown.jaw, options)) for crown in crowns]
+    groups = same_teeth(overlaps, [JAWS.index(crown.jaw) for crown in crowns], looks)
+    whole = _wholes(overlaps, groups, looking_alike(looks))
+    named: list[tuple[_Tooth, int, float]] = []
+    for jaw in JAWS:
+        found = [
+            _tooth(group, jaw, crowns, overlaps, options)
+            for k, group in enumerate(groups)
+            if crowns[group[0]].jaw == jaw and whole[k] == k and len(group) > 1
+        ]
+        found = [found[k] for k in _order(found, overlaps)]
+        shares, _ = row_probabilities(
+            np.array([tooth.evidence for tooth in found]).reshape(-1, POSITIONS), options,
+            np.array([tooth.weight for tooth in found]),
+        )  # fmt: skip
+        for tooth, share in zip(found, shares, strict=True):
+            if np.argmax(share) < POSITIONS:
+                named.append((tooth, int(np.argmax(share)), float(share.max())))
+    milk = _milk([tooth.primary[place] for tooth, place, _ in named])
+    result: Numbers = {}
+    for (tooth, place, sure), odds in zip(named, milk, strict=True):
+        for member in tooth.members:
+            result[overlaps.place(member)] = _number(tooth.jaw, place, sure, odds)
+    for k, group in enumerate(groups):
+        if whole[k] != k:
+            first = groups[whole[k]][0]
+            same = crowns[first].jaw == crowns[group[0]].jaw
+            for member in group:
+                number = result.get(overlaps.place(first), NONE) if same else NONE
+                result[overlaps.place(member)] = number
+    return result
+
+
+def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[int]:
+    """Of each group itself, or the larger one of whose tooth it shows a part."""
+    of = {member: k for k, group in enumerate(groups) for member in group}
+    whole = list(range(len(groups)))
+    for k, group in enumerate(groups):
+        shown = float(overlaps.shown[group].sum())
+        into: dict[int, float] = {}
+        for (i, j), share in overlaps.onto.items():
+            if of[i] == k and overlaps.shown[i, overlaps.sightings[j].view] > 0:
+                weight = overlaps.shown[i, overlaps.sightings[j].view]
+                into[of[j]] = into.get(of[j], 0.0) + share * weight
+        others = {o: w for o, w in into.items() if o < k}  # larger ones
+        if shown >= LEAST_SHOWN and others:
+            best = max(others, key=lambda o: others[o])
+            looks = float(alike[np.ix_(group, groups[best])].mean())
+            if others[best] > (PART - looks) * shown and into.get(k, 0.0) < others[best]:
+                whole[k] = whole[best]
+    return whole
+
+
+def _tooth(
+    members: list[int], jaw: Jaw, crowns: list[Crown], overlaps: Overlaps, options: ChainOptions
+) -> _Tooth:
+    looks = np.array([crown_evidence(crowns[k], jaw, options) for k in members])
+    weight = len(members) ** JOINT_POWER
+    primary = np.array([_primary(crowns[k], jaw) for k in members]).mean(0) * weight
+    centre = np.median([overlaps.sightings[k].centre for k in members], axis=0)
+    return _Tooth(members, jaw, centre, weight, looks.mean(0) * weight, primary)
+
+
+def _primary(crown: Crown, jaw: Jaw) -> Array:
+    """[14] log odds of a primary tooth in each place; -inf where there is none."""
+    numbers = believed(crown)
+    odds = np.full(POSITIONS, -np.inf)
+    for position, tooth in enumerate(teeth_of(jaw)):
+        if tooth % 10 <= 5:
+            milk, lasting = (numbers.get(n, 0.0) + 1e-3 for n in (primary_of(tooth), tooth))
+            odds[position] = np.log(milk / lasting)
+    return odds
+
+
+def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
+    """The teeth of a row from the patient's right to the left, as all photographs have them.
+
+    Neighbours in a photograph are as far apart along the row as their centres are in the world;
+    places along the row are the least squares of that.
+    """
+    if not teeth:
+        return []
+    of = {member: k for k, tooth in enumerate(teeth) for member in tooth.members}
+    rows: dict[int, list[tuple[int, int]]] = {}
+    for member, k in of.items():
+        sighting = overlaps.sightings[member]
+        rows.setdefault(sighting.view, []).append((sighting.index, k))
+    equations, wanted = [], []
+    for row in rows.values():
+        numbers = [k for _, k in sorted(row)]
+        for a, b in zip(numbers, numbers[1:], strict=False):
+            if a != b:
+                equation = np.zeros(len(teeth))
+                equation[[a, b]] = -1, 1
+                equations.append(equation)
+                wanted.append(float(np.linalg.norm(teeth[b].centre - teeth[a].centre)))
+    usual = float(np.median(wanted)) if wanted else 1.0
+    for k, tooth in enumerate(teeth):
+        equation = np.zeros(len(teeth))
+        equation[k] = LOOKS_IN_ORDER
+        equations.append(equation)
+        place = float(softmax(tooth.evidence) @ np.arange(POSITIONS))
+        wanted.append(LOOKS_IN_ORDER * usual * place)
+    along = np.linalg.lstsq(np.array(equations), np.array(wanted), rcond=None)[0]
+    return [int(k) for k in np.argsort(along, kind="stable")]
+
+
+def _milk(odds: Sequence[float]) -> list[float]:
+    """Log odds of primary teeth, knowing the others of the mouth: -inf stays.
+
+    The share of primary teeth among the places that have one is unknown (Jeffreys' prior), and the
+    other teeth tell it: where all are permanent, a retained one must look the more like it.
+    """
+    looks = np.array(odds, np.float64)
+    able = np.isfinite(looks)
+    posterior = looks[able]
+    for _ in range(ROUNDS):
+        shares = expit(posterior)
+        others = shares.sum() - shares
+        posterior = looks[able] + np.log((others + 0.5) / (len(shares) - 1 - others + 0.5))
+    looks[able] = posterior
+    return looks.tolist()
+
+
+def _number(jaw: Jaw, place: int, sure: float, odds: float) -> tuple[int, float]:
+    """FDI number and doubt of a place in the row, how sure that is, and log odds of primary."""
+    number = teeth_of(jaw)[place]
+    if odds > 0:
+        number = primary_of(number)
+    return number, float(np.clip(1 - sure * expit(abs(odds)), LEAST_DOUBT, 1))

@@ -1,0 +1,215 @@
+"""Which crowns of placed photographs are the same tooth, by the surface that they show.
+
+The pixels of a crown are carried into the other photographs by their depth. Where most of two
+crowns fall onto each other, they are probably one tooth; where both photographs show both places
+and they do not, they are two. What all pairs say together is settled by correlation clustering
+(Bansal, Blum and Chawla 2004), contracting the strongest edge first (Keuper et al., ICCV 2015:
+greedy additive edge contraction).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.teeth import Dentition, filled
+from pipeline.artifacts.views import View
+from stages.dentition.working import outline_in_view
+
+Array = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+
+#: Samples along the longer side of a photograph: a lower incisor from the front is four wide.
+SAMPLES = 160
+#: Two depths are of one place if they differ by less than this share: .02 of 12 cm are 2.4 mm,
+#: less than half a tooth, more than dense stereo is off by on wet enamel.
+SAME_DEPTH = 0.02
+#: A photograph says nothing of a crown of which it shows fewer samples than this, or less than this
+#: share of those that there are.
+LEAST_SAMPLES, LEAST_SHOWN = 6, 0.3
+#: Crowns that cover each other by more than this (geometric mean of both shares) are rather one
+#: tooth. Neighbours share some pixels at their border, halves of a crown and the whole have .7.
+SAME_OVERLAP = 0.45
+LOOKS = 0.8
+#: Crowns of one photograph are two teeth, or parts of one: this speaks against one.
+APART = -2.0
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One crown in one placed photograph.
+
+    Attributes:
+        view: index of the photograph among the placed ones.
+        index: of the crown among `Dentition.all_crowns`.
+        centre: [3] median of its surface, in the world.
+    """
+
+    view: int
+    index: int
+    centre: Array
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """How crowns cover each other in the photographs.
+
+    Attributes:
+        sightings: the crowns whose depth is known.
+        shown: [N, V] share of a crown's samples that another photograph shows.
+        onto: {(i, j): share}, of the samples of crown i that the photograph of crown j shows, those
+            that lie in crown j.
+    """
+
+    sightings: list[Sighting]
+    shown: Array
+    onto: dict[tuple[int, int], float]
+
+    def place(self, sighting: int) -> tuple[int, int]:
+        """Index of the photograph, and of the crown in it."""
+        return self.sightings[sighting].view, self.sightings[sighting].index
+
+
+def crown_overlaps(
+    views: Sequence[View], dentitions: Sequence[Dentition | None], cameras: Sequence[Camera],
+    depths: Sequence[Map],
+) -> Overlaps:  # fmt: skip
+    """Carry the crowns of each photograph into every other one.
+
+    Args:
+        views: the placed photographs.
+        dentitions: of each; None where it takes no part.
+        cameras, depths: of each, with z-depth [H, W], 0 where unknown.
+    """
+    maps = [
+        np.zeros(depth.shape, np.int32) if dentition is None else _numbered(dentition, view)
+        for view, dentition, depth in zip(views, dentitions, depths, strict=True)
+    ]
+    sightings: list[Sighting] = []
+    points: list[Array] = []
+    known: list[dict[int, int]] = []  # of each photograph: crown -> sighting
+    for v, (camera, depth, crowns) in enumerate(zip(cameras, depths, maps, strict=True)):
+        step = max(1, max(depth.shape) // SAMPLES)
+        rows, columns = (a * step + step // 2 for a in np.indices([n // step for n in depth.shape]))
+        label, z = crowns[rows, columns], np.asarray(depth, np.float64)[rows, columns]
+        used = (label > 0) & (z > 0)
+        label, z = label[used], z[used]
+        rays = np.column_stack(
+            [
+                (columns[used] + 0.5 - camera.cx) / camera.fx,
+                (rows[used] + 0.5 - camera.cy) / camera.fy,
+                np.ones(len(z)),
+            ]
+        )
+        world = (rays * z[:, None] - camera.translation) @ camera.rotation
+        mine: dict[int, int] = {}
+        for crown in np.unique(label):
+            surface = world[label == crown]
+            if len(surface) >= LEAST_SAMPLES:
+                mine[int(crown) - 1] = len(sightings)
+                sightings.append(Sighting(v, int(crown) - 1, np.median(surface, axis=0)))
+                points.append(surface)
+        known.append(mine)
+    shown = np.zeros((len(sightings), len(views)))
+    onto: dict[tuple[int, int], float] = {}
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(int)
+    owner = np.repeat(np.arange(len(points)), np.diff(starts))
+    everything = np.concatenate(points) if points else np.zeros((0, 3))
+    for w, (camera, depth, crowns) in enumerate(zip(cameras, depths, maps, strict=True)):
+        pixels, z = camera.project(everything)
+        column, row = np.floor(pixels).astype(int).T
+        height, width = depth.shape
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        there = np.where(inside, depth[row * inside, column * inside], 0.0)
+        seen = inside & (np.abs(there - z) < SAME_DEPTH * z)
+        shown[:, w] = np.bincount(owner[seen], minlength=len(points)) / np.diff(starts)
+        label = crowns[row * seen, column * seen]
+        counts = np.bincount(owner[seen], minlength=len(points))
+        for crown, j in known[w].items():
+            hits = np.bincount(owner[seen & (label == crown + 1)], minlength=len(points))
+            for i in np.flatnonzero(hits):
+                if sightings[i].view != w:
+                    onto[int(i), j] = float(hits[i] / counts[i])
+    for k, sighting in enumerate(sightings):
+        shown[k, sighting.view] = 0.0
+        enough = shown[k] * (starts[k + 1] - starts[k]) >= LEAST_SAMPLES
+        shown[k] *= enough & (shown[k] >= LEAST_SHOWN)
+    return Overlaps(sightings, shown, onto)
+
+
+def _numbered(dentition: Dentition, view: View) -> npt.NDArray[np.int32]:
+    """[H, W] 1 + the index of the crown at each pixel of a view; 0: none."""
+    labels = np.zeros((view.height, view.width), np.int32)
+    for k, crown in enumerate(dentition.all_crowns):
+        if len(crown.outline) >= 3:
+            outline = outline_in_view(crown.outline, dentition.size, view)
+            labels[filled((replace(crown, outline=outline),), (view.width, view.height))] = k + 1
+    return labels
+
+
+def same_teeth(
+    overlaps: Overlaps, rows: Sequence[int], looks: Sequence[Array]
+) -> list[list[int]]:
+    """Sightings of the same tooth together, largest group first.
+
+    Args:
+        overlaps: of the crowns.
+        rows: of each sighting, its jaw: those of two jaws are never one tooth.
+        looks: of each, [14] probabilities of the places in its row by its looks.
+    """
+    alike = looking_alike(looks)
+    sightings, count = overlaps.sightings, len(overlaps.sightings)
+    edges: list[dict[int, float]] = [{} for _ in range(count)]
+    for i in range(count):
+        for j in range(i + 1, count):
+            if rows[i] != rows[j]:
+                continue
+            if sightings[i].view == sightings[j].view:
+                weight = APART
+            else:
+                there, back = overlaps.shown[i, sightings[j].view], overlaps.shown[j, sightings[i].view]
+                if min(there, back) <= 0:
+                    continue
+                share = overlaps.onto.get((i, j), 0.0) * overlaps.onto.get((j, i), 0.0)
+                weight = (np.sqrt(share) - SAME_OVERLAP + alike[i, j]) * min(there, back)
+            edges[i][j] = edges[j][i] = float(weight)
+    return _contracted(edges)
+
+
+def looking_alike(looks: Sequence[Array]) -> Array:
+    """[N, N] what looks say for crowns being one tooth, against it below 0, as shares of overlap.
+
+    Args:
+        looks: as of `same_teeth`.
+    """
+    places = np.array(looks).reshape(len(looks), -1)
+    return np.asarray(LOOKS * (np.sqrt(places @ places.T) - 0.5))
+
+
+def _contracted(edges: list[dict[int, float]]) -> list[list[int]]:
+    """Groups of nodes: the edge that speaks most for its ends being one is contracted, and again."""
+    groups = {k: [k] for k in range(len(edges))}
+    queue = [(-w, i, j) for i, mine in enumerate(edges) for j, w in mine.items() if i < j and w > 0]
+    heapq.heapify(queue)
+    while queue:
+        weight, i, j = heapq.heappop(queue)
+        if i not in groups or j not in groups or edges[i].get(j) != -weight:
+            continue  # of before one of its ends grew
+        if len(edges[i]) < len(edges[j]):
+            i, j = j, i
+        groups[i] += groups.pop(j)
+        del edges[i][j]
+        for k, w in edges[j].items():
+            if k == i:
+                continue
+            del edges[k][j]
+            edges[i][k] = edges[k][i] = edges[i].get(k, 0.0) + w
+            if edges[i][k] > 0:
+                heapq.heappush(queue, (-edges[i][k], min(i, k), max(i, k)))
+        edges[j] = {}
+    return sorted((sorted(group) for group in groups.values()), key=lambda g: (-len(g), g))
