@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -36,9 +37,9 @@ Numbers = dict[tuple[int, int], tuple[int, float]]
 
 #: Photographs of one tooth look alike and err together: n of them count as n to this power.
 JOINT_POWER = 0.75
-#: A tooth of which so much lies in another's crowns, in photographs that show it, is a part of that.
-PART = 0.6
-LEAST_SHOWN = 1.0
+#: A tooth of which so much lies in another's crowns in other photographs, where it lies in any, is
+#: a part of that; those must show as much as the whole of it once.
+PART, LEAST_SHOWN = 0.8, 1.0
 #: Weight of the expected places in the order of a row, against what photographs say.
 LOOKS_IN_ORDER = 1e-3
 LEAST_DOUBT = 1e-4
@@ -121,11 +122,14 @@ def _completed(
     crowns: Sequence[Crown], known: Sequence[tuple[int, float] | None], jaw: Jaw,
     options: ChainOptions,
 ) -> tuple[Crown, ...]:  # fmt: skip
-    result, row = list(crowns), []
+    """One row: crowns without an agreed number stand between those that have one, as sure ones."""
+    result = list(crowns)
+    row: list[int] = []
     for k, (crown, agreed) in enumerate(zip(crowns, known, strict=True)):
         if agreed is not None and not said(crown):
             result[k] = replace(crown, number=agreed[0], doubt=agreed[1])
         number = result[k].number
+        # parts of one tooth stand in the row once, what is no tooth not at all
         if agreed is None or (number and number not in [result[j].number for j in row]):
             row.append(k)
     fixed = [replace(result[k], doubt=0.0) if known[k] else result[k] for k in row]
@@ -187,13 +191,13 @@ def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[i
     of = {member: k for k, group in enumerate(groups) for member in group}
     whole = list(range(len(groups)))
     for k, group in enumerate(groups):
-        shown = float(overlaps.shown[group].sum())
         into: dict[int, float] = {}
         for (i, j), share in overlaps.onto.items():
             if of[i] == k and overlaps.shown[i, overlaps.sightings[j].view] > 0:
                 weight = overlaps.shown[i, overlaps.sightings[j].view]
                 into[of[j]] = into.get(of[j], 0.0) + share * weight
         others = {o: w for o, w in into.items() if o < k}  # larger ones
+        shown = sum(into.values())
         if shown >= LEAST_SHOWN and others:
             best = max(others, key=lambda o: others[o])
             looks = float(alike[np.ix_(group, groups[best])].mean())
@@ -239,7 +243,7 @@ def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
     equations, wanted = [], []
     for row in rows.values():
         numbers = [k for _, k in sorted(row)]
-        for a, b in zip(numbers, numbers[1:], strict=False):
+        for a, b in pairwise(numbers):
             if a != b:
                 equation = np.zeros(len(teeth))
                 equation[[a, b]] = -1, 1

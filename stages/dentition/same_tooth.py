@@ -152,9 +152,7 @@ def _numbered(dentition: Dentition, view: View) -> npt.NDArray[np.int32]:
     return labels
 
 
-def same_teeth(
-    overlaps: Overlaps, rows: Sequence[int], looks: Sequence[Array]
-) -> list[list[int]]:
+def same_teeth(overlaps: Overlaps, rows: Sequence[int], looks: Sequence[Array]) -> list[list[int]]:
     """Sightings of the same tooth together, largest group first.
 
     Args:
@@ -172,7 +170,10 @@ def same_teeth(
             if sightings[i].view == sightings[j].view:
                 weight = APART
             else:
-                there, back = overlaps.shown[i, sightings[j].view], overlaps.shown[j, sightings[i].view]
+                there, back = (
+                    overlaps.shown[i, sightings[j].view],
+                    overlaps.shown[j, sightings[i].view],
+                )
                 if min(there, back) <= 0:
                     continue
                 share = overlaps.onto.get((i, j), 0.0) * overlaps.onto.get((j, i), 0.0)
@@ -192,7 +193,7 @@ def looking_alike(looks: Sequence[Array]) -> Array:
 
 
 def _contracted(edges: list[dict[int, float]]) -> list[list[int]]:
-    """Groups of nodes: the edge that speaks most for its ends being one is contracted, and again."""
+    """Groups of nodes: again and again, the edge that speaks most for one tooth is contracted."""
     groups = {k: [k] for k in range(len(edges))}
     queue = [(-w, i, j) for i, mine in enumerate(edges) for j, w in mine.items() if i < j and w > 0]
     heapq.heapify(queue)

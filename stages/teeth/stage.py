@@ -67,9 +67,7 @@ class TeethStage(Stage):
         for k, dentition in zip(read, chosen, strict=True):
             found[k] = resized_dentition(dentition, (views[k].width, views[k].height))
         dentitions = [found[k] for k in read]
-        pictures = {
-            views[k].name: labelled_overlay(views[k].image, found[k]) for k in read
-        }
+        pictures = {views[k].name: labelled_overlay(views[k].image, found[k]) for k in read}
         teeth = Teeth(tuple(found), pictures)
         if teeth.chosen:
             for name, dentition in zip(names, dentitions, strict=True):

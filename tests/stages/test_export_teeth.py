@@ -17,10 +17,10 @@ from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
+from stages.dentition.working import outline_in_view
 from stages.export.measuring.teeth_table import teeth_table, tooth_name
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage
-from stages.dentition.working import outline_in_view
 from stages.export.teeth import (
     SeenCrown,
     describe_teeth,

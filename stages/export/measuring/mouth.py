@@ -12,13 +12,13 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
+from stages.dentition.working import outline_in_view
 from stages.export.measuring.landmarks import (
     landmark_pixels,
     moved_dentition,
     read_landmarks,
 )
 from stages.export.measuring.measures import measure_mouth, mouth_axes
-from stages.dentition.working import outline_in_view
 from stages.export.teeth import LEAST_ALPHA
 from stages.splatting.rendering import RenderedView
 

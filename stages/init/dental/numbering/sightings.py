@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
-from pipeline.artifacts.teeth import Crown, Dentition, Point
+from pipeline.artifacts.teeth import Dentition, Point
 from stages.dentition.tooth_rows import (
     NO_TOOTH,
     SAID_OTHERWISE,
@@ -145,7 +145,9 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                 embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
                 embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
                 doubtful=doubtful,
-                looks=np.array([crown_evidence(crown, jaw, LOOKS) for crown in crowns]).reshape(-1, POSITIONS),
+                looks=np.array([crown_evidence(crown, jaw, LOOKS) for crown in crowns]).reshape(
+                    -1, POSITIONS
+                ),
                 scores=np.array([crown.score for crown in crowns], np.float64),
             )
         )
