@@ -209,9 +209,10 @@ def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[i
 def _tooth(
     members: list[int], jaw: Jaw, crowns: list[Crown], overlaps: Overlaps, options: ChainOptions
 ) -> _Tooth:
-    looks = np.array([crown_evidence(crowns[k], jaw, options) for k in members])
+    heard = [crowns[k] for k in members if said(crowns[k])] or [crowns[k] for k in members]
+    looks = np.array([crown_evidence(crown, jaw, options) for crown in heard])
     weight = len(members) ** JOINT_POWER
-    primary = np.array([_primary(crowns[k], jaw) for k in members]).mean(0) * weight
+    primary = np.array([_primary(crown, jaw) for crown in heard]).mean(0) * weight
     centre = np.median([overlaps.sightings[k].centre for k in members], axis=0)
     return _Tooth(members, jaw, centre, weight, looks.mean(0) * weight, primary)
 

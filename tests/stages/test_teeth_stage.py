@@ -1,0 +1,70 @@
+"""The `teeth` stage: how much of a film is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.views import View, Views
+from pipeline.stage import LocalContext
+from stages.teeth.config import TeethConfig
+from stages.teeth.read import Reading
+from stages.teeth.stage import TeethStage
+
+COUNT = 30
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The photographs that are read; nothing is found in them."""
+    names: list[str] = []
+
+    class Reader:
+        def __init__(self, views: list[View], threads: int) -> None:
+            self.views = views
+
+        def shows_teeth(self) -> bool:
+            return True
+
+        def read(self, progress: Callable[..., None]) -> list[Reading]:
+            names.extend(view.name for view in self.views)
+            kinds = {"upper": 0.0, "lower": 0.0, "other": 1.0}
+            return [
+                Reading(Dentition(view.name, (view.width, view.height), "other"), kinds, 0.0)
+                for view in self.views
+            ]
+
+    monkeypatch.setattr("stages.teeth.reader.PhotographReader", Reader)
+    return names
+
+
+def run(folder: Path, **config: Any) -> Teeth:
+    image = np.full((24, 32, 3), 0.5, np.float32)
+    views = Views(tuple(View(f"{k:03d}", image) for k in range(COUNT)))
+    context = LocalContext(TeethConfig(**config), folder, {"views": views})
+    TeethStage().run(context)
+    teeth: Teeth = context.result("teeth")
+    return teeth
+
+
+def test_of_a_film_some_frames_are_read_from_end_to_end(tmp_path: Path, asked: list[str]) -> None:
+    teeth = run(tmp_path)
+    assert len(teeth.views) == COUNT
+    numbers = [int(name) for name in asked]
+    assert (len(numbers), numbers[0], numbers[-1]) == (12, 0, COUNT - 1)
+    assert set(np.diff(numbers)) <= {2, 3}
+    assert [d.kind for d in teeth.views if d.name not in asked] == ["none"] * (COUNT - 12)
+
+
+def test_the_reader_can_be_told_to_read_all_of_it_or_nothing(
+    tmp_path: Path, asked: list[str]
+) -> None:
+    run(tmp_path / "all", method="reader")
+    assert len(asked) == COUNT
+    run(tmp_path / "none", method="none")
+    assert len(asked) == COUNT
