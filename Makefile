@@ -10,13 +10,21 @@ BIN := .venv/bin
 SEED ?= 0
 INPUTS ?= 1000
 KILLS ?= 30
-.PHONY: demo test lint wheel-test docs gallery bench soak reader system chromium clean
+.PHONY: demo test browsers lint wheel-test docs gallery bench soak reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
 
 test: system chromium .venv/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# What the pages' tests ask in Chromium, in Firefox and in WebKitGTK (Safari's engine) as well.
+browsers: system chromium .venv/installed-dev
+	@tools/system-packages browsers
+	for engine in firefox webkit; do \
+	    PAGES_IN=$$engine xvfb-run -a -s "-screen 0 1600x1200x24" $(BIN)/python -m pytest \
+	        tests/stages/test_viewer_tools.py tests/studies/test_register.py || exit 1; \
+	done
 
 lint: .venv/installed-dev
 	$(BIN)/ruff format --check .

@@ -1,9 +1,10 @@
-"""Pages in headless Chromium."""
+"""Pages in headless Chromium; those that tell what they found also in what PAGES_IN names."""
 
 from __future__ import annotations
 
 import html
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -12,6 +13,10 @@ from typing import Any
 
 import pytest
 
+from tests.other_browsers import told_in
+
+#: Where `run_in` runs its scripts: chromium, firefox or webkit.
+ENGINE = os.environ.get("PAGES_IN", "chromium")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
 
@@ -72,17 +77,23 @@ def run_in(
         file = page.with_name(f"frame_of_{page.name}")
         file.write_text(_FRAME.format(page.name, html.escape(address), *size))
         address = ""
+    window = max(size[0], NARROWEST), size[1]
+    if ENGINE != "chromium":
+        url, scale = f"file://{file}{address}", 0.5 if coarse else 1.0
+        told, messages = told_in(ENGINE, url, folder, window, scale)
+        assert told, f"the script told nothing: {messages}"
+        return json.loads(told), messages
     dom, log = browse(
-        file, folder, (max(size[0], NARROWEST), size[1]), "--dump-dom",
+        file, folder, window, "--dump-dom",
         "--virtual-time-budget=30000", *["--force-device-scale-factor=0.5"] * coarse,
         address=address,
     )  # fmt: skip
-    told = re.search(r'<pre id="told">(.*?)</pre>', dom, re.S)
-    assert told, f"the script told nothing: {console(log)}"
-    return json.loads(html.unescape(told[1])), console(log)
+    found = re.search(r'<pre id="told">(.*?)</pre>', dom, re.S)
+    assert found, f"the script told nothing: {console(log)}"
+    return json.loads(html.unescape(found[1])), console(log)
 
 
-#: Chromium has no narrower windows.
+#: Browsers have no narrower windows.
 NARROWEST = 500
 _TELL = """<script>
 function tell(result) {

@@ -18,7 +18,7 @@ from stages.export.viewer import page as viewer_page
 from stages.export.viewer.knowledge import photographs_that_saw, seen_surfaces
 from stages.export.viewer.page import Knowledge, build_page, rasterizer_constants
 from stages.splatting.rendering import render
-from tests.browser import needs_chromium, run_in
+from tests.browser import ENGINE, NARROWEST, needs_chromium, run_in
 from tests.stages import export_scene as scene
 
 MM = {"unit": "mm", "source": "length", "uncertainty_percent": 2.0, "text": "A length was given."}
@@ -382,7 +382,9 @@ def test_everything_has_a_name_and_a_place(tmp_path: Path, width: int) -> None:
     assert found["small"] == []
     assert found["wide"] <= 0 and found["outside"] == 0
     assert found["sheet"][0] >= 0 and found["sheet"][1] <= width
-    assert (found["focus"], found["back"], found["closed"]) == ("done", "more", True)
+    assert found["closed"]
+    if ENGINE != "webkit" or width >= NARROWEST:  # it gives a frame no focus unless it is touched
+        assert (found["focus"], found["back"]) == ("done", "more")
     assert found["live"] >= 2
 
 
