@@ -83,7 +83,7 @@ def write_visits(
         distance, side = float(rng.uniform(115, 150)), float(rng.uniform(1.75, 2.0))
         cameras = {}
         for k, yaw in enumerate(np.linspace(-reach, reach, views)):
-            camera = _camera(mouth, yaw, distance, side * distance / 125, width, rng)
+            camera = camera_by_hand(mouth, yaw, distance, side * distance / 125, width, rng)
             role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
             photo = photograph(
                 mouth, rng, role, width=camera.width, height=camera.height, bite="closed",
@@ -101,7 +101,7 @@ def write_visits(
     (out / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
 
 
-def _camera(
+def camera_by_hand(
     mouth: Mouth, yaw: float, distance: float, side: float, width: int, rng: np.random.Generator
 ) -> Camera:
     """A camera that looks at the front teeth, held by hand: a little off everywhere."""

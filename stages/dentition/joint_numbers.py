@@ -2,8 +2,8 @@
 
 A photograph by itself counts teeth from what it shows: where a crown is hidden, or read as two, all
 that follow may carry their neighbours' numbers. Once the photographs are placed, the surface says
-which crowns are one tooth; looks of all of them together, and the order that all rows have in
-common, number it.
+which crowns are one tooth; looks of all of them together, the order that all rows have in common,
+and the spaces between neighbours number it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pipeline.artifacts.dental.fdi import JAWS, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike, same_teeth
+from stages.dentition.spacing import spacing_evidence, unit_of
 from stages.dentition.tooth_rows import (
     POSITIONS,
     ChainOptions,
@@ -81,8 +82,9 @@ def agreed_numbers(
 ) -> Teeth:
     """The teeth with the numbers that all placed photographs together give their crowns.
 
-    Photographs that are not placed keep theirs, and so do crowns whose depth is unknown. What a
-    person has said (doubt 0) stays, and counts for the same tooth in the other photographs.
+    Photographs that are not placed keep theirs. Crowns that show no tooth of another photograph,
+    or whose depth is unknown, are numbered by their photograph's row, in which the others stand
+    fast. What a person has said (doubt 0) stays, and counts for the same tooth everywhere.
 
     Args:
         teeth: as each photograph was read by itself.
@@ -156,21 +158,20 @@ def _numbers(
     looks = [softmax(crown_evidence(crown, crown.jaw, options)) for crown in crowns]
     groups = same_teeth(overlaps, [JAWS.index(crown.jaw) for crown in crowns], looks)
     whole = _wholes(overlaps, groups, looking_alike(looks))
-    named: list[tuple[_Tooth, int, float]] = []
+    rows = []
     for jaw in JAWS:
         found = [
             _tooth(group, jaw, crowns, overlaps, options)
             for k, group in enumerate(groups)
             if crowns[group[0]].jaw == jaw and whole[k] == k and len(group) > 1
         ]
-        found = [found[k] for k in _order(found, overlaps)]
-        shares, _ = row_probabilities(
-            np.array([tooth.evidence for tooth in found]).reshape(-1, POSITIONS), options,
-            np.array([tooth.weight for tooth in found]),
-        )  # fmt: skip
-        for tooth, share in zip(found, shares, strict=True):
-            if np.argmax(share) < POSITIONS:
-                named.append((tooth, int(np.argmax(share)), float(share.max())))
+        rows.append([found[k] for k in _order(found, overlaps)])
+    named = [
+        (tooth, int(np.argmax(share)), float(share.max()))
+        for row, shares in zip(rows, _places(rows, options), strict=True)
+        for tooth, share in zip(row, shares, strict=True)
+        if np.argmax(share) < POSITIONS
+    ]
     milk = _milk([tooth.primary[place] for tooth, place, _ in named])
     result: Numbers = {}
     for (tooth, place, sure), odds in zip(named, milk, strict=True):
@@ -184,6 +185,28 @@ def _numbers(
                 number = result.get(overlaps.place(first), NONE) if same else NONE
                 result[overlaps.place(member)] = number
     return result
+
+
+def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:
+    """[n, 15] of each row, its teeth's probabilities of the positions and of being no tooth.
+
+    First by looks and order; neighbours by these tell how large the mouth is, and the spaces
+    between teeth then count as well.
+    """
+    evidence = [np.array([tooth.evidence for tooth in row]).reshape(-1, POSITIONS) for row in rows]
+    weights = [np.array([tooth.weight for tooth in row]) for row in rows]
+    centres = [np.array([tooth.centre for tooth in row]).reshape(-1, 3) for row in rows]
+    given = list(zip(evidence, weights, strict=True))
+    first = [row_probabilities(looks, options, weight)[0] for looks, weight in given]
+    unit = unit_of(
+        [(jaw, place, s.argmax(1)) for jaw, place, s in zip(JAWS, centres, first, strict=True)]
+    )
+    if unit is None:
+        return first
+    return [
+        row_probabilities(looks, options, weight, spacing_evidence(jaw, place, unit))[0]
+        for jaw, place, (looks, weight) in zip(JAWS, centres, given, strict=True)
+    ]
 
 
 def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[int]:

@@ -75,13 +75,16 @@ def crown_evidence(crown: Crown, jaw: Jaw, options: ChainOptions) -> Array:
 
 
 def row_probabilities(
-    evidence: Array, options: ChainOptions, weights: Array | None = None
-) -> tuple[Array, float]:
+    evidence: Array, options: ChainOptions, weights: Array | None = None,
+    spacing: Array | None = None,
+) -> tuple[Array, float]:  # fmt: skip
     """Probabilities of each crown's position in its row.
 
     Args:
         evidence: [n, 14] log probability of each position by looks, crowns from left to right.
         weights: [n] as how many crowns each counts in being no tooth; None: as one.
+        spacing: [n, 14, 14] log likelihood of the position before and that of each crown, by how
+            far they are apart.
 
     Returns:
         [n, 15] probabilities of the positions and (last) of being no tooth of this row; and the
@@ -96,23 +99,26 @@ def row_probabilities(
     for a in range(states):
         for b in range(a + 1, states):
             step[a, b] = 0.0 if a == 0 else -options.skipped * (b - a - 1)
+    steps = np.repeat(step[None], count, axis=0)
+    if spacing is not None:
+        steps[:, 1:, 1:] += spacing
     stay = -(options.none + np.log(POSITIONS)) * (np.ones(count) if weights is None else weights)
     forward = np.full((count + 1, states), -np.inf)
     forward[0, 0] = 0.0
     for k in range(count):
-        moved = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)
+        moved = np.logaddexp.reduce(forward[k][:, None] + steps[k], axis=0)
         moved[1:] += evidence[k]
         forward[k + 1] = np.logaddexp(moved, forward[k] + stay[k])
     backward = np.zeros((count + 1, states))
     for k in range(count - 1, -1, -1):
         ahead = backward[k + 1].copy()
         ahead[1:] += evidence[k]
-        taken = np.logaddexp.reduce(step + ahead[None], axis=1)
+        taken = np.logaddexp.reduce(steps[k] + ahead[None], axis=1)
         backward[k] = np.logaddexp(taken, backward[k + 1] + stay[k])
     total = float(backward[0, 0])
     result = np.zeros((count, POSITIONS + 1))
     for k in range(count):
-        arrive = np.logaddexp.reduce(forward[k][:, None] + step, axis=0)[1:]
+        arrive = np.logaddexp.reduce(forward[k][:, None] + steps[k], axis=0)[1:]
         result[k, :POSITIONS] = np.exp(arrive + evidence[k] + backward[k + 1][1:] - total)
         result[k, POSITIONS] = np.exp(
             np.logaddexp.reduce(forward[k] + stay[k] + backward[k + 1]) - total
