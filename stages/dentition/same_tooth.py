@@ -10,7 +10,7 @@ greedy additive edge contraction).
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +35,8 @@ LEAST_SAMPLES, LEAST_SHOWN = 6, 0.3
 #: Crowns that cover each other by more than this (geometric mean of both shares) are rather one
 #: tooth. Neighbours share some pixels at their border, halves of a crown and the whole have .7.
 SAME_OVERLAP = 0.45
+#: What it counts, as such a share, that crowns surely look like the same place in the row; half of
+#: it speaks against one tooth where they surely do not. Depth may be off by a tooth; so may looks.
 LOOKS = 0.8
 #: Crowns of one photograph are two teeth, or parts of one: this speaks against one.
 APART = -2.0
@@ -91,55 +93,62 @@ def crown_overlaps(
         for view, dentition, depth in zip(views, dentitions, depths, strict=True)
     ]
     sightings: list[Sighting] = []
-    points: list[Array] = []
-    known: list[dict[int, int]] = []  # of each photograph: crown -> sighting
+    surfaces: list[Array] = []
     for v, (camera, depth, crowns) in enumerate(zip(cameras, depths, maps, strict=True)):
-        step = max(1, max(depth.shape) // SAMPLES)
-        rows, columns = (a * step + step // 2 for a in np.indices([n // step for n in depth.shape]))
-        label, z = crowns[rows, columns], np.asarray(depth, np.float64)[rows, columns]
-        used = (label > 0) & (z > 0)
-        label, z = label[used], z[used]
-        rays = np.column_stack(
-            [
-                (columns[used] + 0.5 - camera.cx) / camera.fx,
-                (rows[used] + 0.5 - camera.cy) / camera.fy,
-                np.ones(len(z)),
-            ]
-        )
-        world = (rays * z[:, None] - camera.translation) @ camera.rotation
-        mine: dict[int, int] = {}
-        for crown in np.unique(label):
-            surface = world[label == crown]
-            if len(surface) >= LEAST_SAMPLES:
-                mine[int(crown) - 1] = len(sightings)
-                sightings.append(Sighting(v, int(crown) - 1, np.median(surface, axis=0)))
-                points.append(surface)
-        known.append(mine)
-    shown = np.zeros((len(sightings), len(views)))
+        for index, surface in _surfaces(camera, depth, crowns):
+            sightings.append(Sighting(v, index, np.median(surface, axis=0)))
+            surfaces.append(surface)
+    count = len(sightings)
+    sizes = np.array([len(surface) for surface in surfaces], np.int64)
+    owner = np.repeat(np.arange(count), sizes)
+    points = np.concatenate(surfaces) if surfaces else np.zeros((0, 3))
+    shown = np.zeros((count, len(views)))
     onto: dict[tuple[int, int], float] = {}
-    starts = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(int)
-    owner = np.repeat(np.arange(len(points)), np.diff(starts))
-    everything = np.concatenate(points) if points else np.zeros((0, 3))
     for w, (camera, depth, crowns) in enumerate(zip(cameras, depths, maps, strict=True)):
-        pixels, z = camera.project(everything)
-        column, row = np.floor(pixels).astype(int).T
-        height, width = depth.shape
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        there = np.where(inside, depth[row * inside, column * inside], 0.0)
-        seen = inside & (np.abs(there - z) < SAME_DEPTH * z)
-        shown[:, w] = np.bincount(owner[seen], minlength=len(points)) / np.diff(starts)
-        label = crowns[row * seen, column * seen]
-        counts = np.bincount(owner[seen], minlength=len(points))
-        for crown, j in known[w].items():
-            hits = np.bincount(owner[seen & (label == crown + 1)], minlength=len(points))
-            for i in np.flatnonzero(hits):
-                if sightings[i].view != w:
-                    onto[int(i), j] = float(hits[i] / counts[i])
-    for k, sighting in enumerate(sightings):
-        shown[k, sighting.view] = 0.0
-        enough = shown[k] * (starts[k + 1] - starts[k]) >= LEAST_SAMPLES
-        shown[k] *= enough & (shown[k] >= LEAST_SHOWN)
+        seen, label = _carried(points, camera, depth, crowns)
+        samples = np.bincount(owner[seen], minlength=count)
+        enough = (samples >= LEAST_SAMPLES) & (samples >= LEAST_SHOWN * sizes)
+        shown[:, w] = np.where(enough, samples / np.maximum(sizes, 1), 0.0)
+        for j, sighting in enumerate(sightings):
+            if sighting.view == w:
+                shown[j, w] = 0.0
+                hits = np.bincount(owner[seen & (label == sighting.index + 1)], minlength=count)
+                for i in np.flatnonzero(hits):
+                    if sightings[i].view != w:
+                        onto[int(i), j] = float(hits[i] / samples[i])
     return Overlaps(sightings, shown, onto)
+
+
+def _surfaces(
+    camera: Camera, depth: Map, crowns: npt.NDArray[np.int32]
+) -> Iterator[tuple[int, Array]]:
+    """Index of each crown in one photograph, with [N, 3] samples of its surface in the world."""
+    step = max(1, max(depth.shape) // SAMPLES)
+    rows, columns = (a * step + step // 2 for a in np.indices([n // step for n in depth.shape]))
+    label, z = crowns[rows, columns], np.asarray(depth, np.float64)[rows, columns]
+    used = (label > 0) & (z > 0)
+    label, z = label[used], z[used]
+    x = (columns[used] + 0.5 - camera.cx) / camera.fx
+    y = (rows[used] + 0.5 - camera.cy) / camera.fy
+    local = np.column_stack([x, y, np.ones(len(z))]) * z[:, None]
+    world = (local - camera.translation) @ camera.rotation
+    for crown in np.unique(label):
+        surface = world[label == crown]
+        if len(surface) >= LEAST_SAMPLES:
+            yield int(crown) - 1, surface
+
+
+def _carried(
+    points: Array, camera: Camera, depth: Map, crowns: npt.NDArray[np.int32]
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int32]]:
+    """[N] which points a photograph shows, and 1 + the index of the crown there, 0: none."""
+    pixels, z = camera.project(points)
+    column, row = np.floor(pixels).astype(int).T
+    height, width = depth.shape
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    there = np.where(inside, depth[row * inside, column * inside], 0.0)
+    seen = inside & (np.abs(there - z) < SAME_DEPTH * z)
+    return seen, crowns[row * seen, column * seen]
 
 
 def _numbered(dentition: Dentition, view: View) -> npt.NDArray[np.int32]:
