@@ -24,13 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples
 
 from data_samples.mouths.mouth import build_mouth
 from data_samples.mouths.options import random_options
-from data_samples.mouths.photo import photograph
-from data_samples.mouths.visits import CALM, camera_by_hand
+from data_samples.mouths.visits import CALM, sweep
 from pipeline.artifacts.teeth import Dentition, Teeth, filled
 from pipeline.store import Store
 
 FRAMES = (12, 10, 9, 6)
 WIDTH = 512
+REACH = 38.0, 50.0  # degrees from the middle to the ends
 
 
 def make_film(folder: Path, seed: int) -> None:
@@ -40,17 +40,10 @@ def make_film(folder: Path, seed: int) -> None:
     calm = CALM if seed % 2 == 0 else {}
     options = random_options(np.random.default_rng([seed, 7]), **calm)
     mouth, rng = build_mouth(options), np.random.default_rng([seed, 8, 0])
-    distance, side = float(rng.uniform(115, 150)), float(rng.uniform(1.75, 2.0))
-    reach = float(rng.uniform(38, 50))
     for name in ("photos", "labels"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    for k, yaw in enumerate(np.linspace(-reach, reach, FRAMES[seed % len(FRAMES)])):
-        camera = camera_by_hand(mouth, yaw, distance, side * distance / 125, WIDTH, rng)
-        role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
-        photo = photograph(
-            mouth, rng, role, width=camera.width, height=camera.height, bite="closed",
-            camera=camera,
-        )  # fmt: skip
+    views = FRAMES[seed % len(FRAMES)]
+    for k, photo in enumerate(sweep(mouth, rng, views, WIDTH, REACH)):
         quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
         cv2.imwrite(str(folder / "photos" / f"{k:03d}.jpg"), photo.image[..., ::-1], quality)
         cv2.imwrite(str(folder / "labels" / f"{k:03d}.png"), photo.labels)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from .cameras import Camera, look
 from .mouth import Mouth, build_mouth
 from .moves import Move, axes_of, motion_of
 from .options import random_options
-from .photo import photograph
+from .photo import Photograph, photograph
 
 
 def random_moves(numbers: list[int], count: int, rng: np.random.Generator) -> dict[int, Move]:
@@ -80,15 +81,9 @@ def write_visits(
         rng = np.random.default_rng([seed, 8, number])
         folder = out / name
         folder.mkdir(parents=True, exist_ok=True)
-        distance, side = float(rng.uniform(115, 150)), float(rng.uniform(1.75, 2.0))
         cameras = {}
-        for k, yaw in enumerate(np.linspace(-reach, reach, views)):
-            camera = camera_by_hand(mouth, yaw, distance, side * distance / 125, width, rng)
-            role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
-            photo = photograph(
-                mouth, rng, role, width=camera.width, height=camera.height, bite="closed",
-                camera=camera, plain=plain,
-            )  # fmt: skip
+        for k, photo in enumerate(sweep(mouth, rng, views, width, (reach, reach), plain)):
+            camera = photo.camera
             quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
             cv2.imwrite(str(folder / f"{k:03d}.jpg"), photo.image[..., ::-1], quality)
             cameras[f"{k:03d}"] = {
@@ -101,7 +96,30 @@ def write_visits(
     (out / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
 
 
-def camera_by_hand(
+def sweep(
+    mouth: Mouth, rng: np.random.Generator, views: int, width: int, reach: tuple[float, float],
+    plain: bool = False,
+) -> Iterator[Photograph]:  # fmt: skip
+    """Photographs of a closed mouth from its right to its left, by a camera held by hand.
+
+    Args:
+        views: how many.
+        width: of the pictures, pixels.
+        reach: degrees from the middle to the first and last, at least and at most.
+        plain: as in `write_visits`.
+    """
+    distance, side = float(rng.uniform(115, 150)), float(rng.uniform(1.75, 2.0))
+    end = float(rng.uniform(*reach)) if reach[0] < reach[1] else reach[0]
+    for yaw in np.linspace(-end, end, views):
+        camera = _camera(mouth, yaw, distance, side * distance / 125, width, rng)
+        role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
+        yield photograph(
+            mouth, rng, role, width=camera.width, height=camera.height, bite="closed",
+            camera=camera, plain=plain,
+        )  # fmt: skip
+
+
+def _camera(
     mouth: Mouth, yaw: float, distance: float, side: float, width: int, rng: np.random.Generator
 ) -> Camera:
     """A camera that looks at the front teeth, held by hand: a little off everywhere."""

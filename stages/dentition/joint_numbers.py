@@ -27,8 +27,8 @@ from stages.dentition.tooth_rows import (
     ChainOptions,
     believed,
     crown_evidence,
+    number_is_said,
     row_probabilities,
-    said,
 )
 
 Array = npt.NDArray[np.float64]
@@ -128,7 +128,7 @@ def _completed(
     result = list(crowns)
     row: list[int] = []
     for k, (crown, agreed) in enumerate(zip(crowns, known, strict=True)):
-        if agreed is not None and not said(crown):
+        if agreed is not None and not number_is_said(crown):
             result[k] = replace(crown, number=agreed[0], doubt=agreed[1])
         number = result[k].number
         # parts of one tooth stand in the row once, what is no tooth not at all
@@ -138,7 +138,7 @@ def _completed(
     evidence = [crown_evidence(crown, jaw, options) for crown in fixed]
     shares, _ = row_probabilities(np.array(evidence).reshape(-1, POSITIONS), options)
     for k, share in zip(row, shares, strict=True):
-        if known[k] is None and not said(crowns[k]):
+        if known[k] is None and not number_is_said(crowns[k]):
             place, number, doubt = int(np.argmax(share)), *NONE
             if place < POSITIONS:
                 odds = float(_primary(crowns[k], jaw)[place])
@@ -172,9 +172,9 @@ def _numbers(
         for tooth, share in zip(row, shares, strict=True)
         if np.argmax(share) < POSITIONS
     ]
-    milk = _milk([tooth.primary[place] for tooth, place, _ in named])
+    primary = _primary_odds([tooth.primary[place] for tooth, place, _ in named])
     result: Numbers = {}
-    for (tooth, place, sure), odds in zip(named, milk, strict=True):
+    for (tooth, place, sure), odds in zip(named, primary, strict=True):
         for member in tooth.members:
             result[overlaps.place(member)] = _number(tooth.jaw, place, sure, odds)
     for k, group in enumerate(groups):
@@ -232,7 +232,9 @@ def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[i
 def _tooth(
     members: list[int], jaw: Jaw, crowns: list[Crown], overlaps: Overlaps, options: ChainOptions
 ) -> _Tooth:
-    heard = [crowns[k] for k in members if said(crowns[k])] or [crowns[k] for k in members]
+    heard = [crowns[k] for k in members if number_is_said(crowns[k])] or [
+        crowns[k] for k in members
+    ]
     looks = np.array([crown_evidence(crown, jaw, options) for crown in heard])
     weight = len(members) ** JOINT_POWER
     primary = np.array([_primary(crown, jaw) for crown in heard]).mean(0) * weight
@@ -284,7 +286,7 @@ def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
     return [int(k) for k in np.argsort(along, kind="stable")]
 
 
-def _milk(odds: Sequence[float]) -> list[float]:
+def _primary_odds(odds: Sequence[float]) -> list[float]:
     """Log odds of primary teeth, knowing the others of the mouth: -inf stays.
 
     The share of primary teeth among the places that have one is unknown (Jeffreys' prior), and the

@@ -56,20 +56,20 @@ def position_evidence(numbers: Mapping[int, float], jaw: Jaw, options: ChainOpti
     return np.asarray(np.log((1 - options.floor * POSITIONS) * share / share.sum() + options.floor))
 
 
-def said(crown: Crown) -> bool:
+def number_is_said(crown: Crown) -> bool:
     """Whether a person has said the crown's number."""
     return crown.doubt == 0 and crown.number != 0
 
 
 def believed(crown: Crown) -> Mapping[int, float]:
     """FDI number -> probability: by its looks, or what a person has said."""
-    return {crown.number: 1.0} if said(crown) else crown.numbers
+    return {crown.number: 1.0} if number_is_said(crown) else crown.numbers
 
 
 def crown_evidence(crown: Crown, jaw: Jaw, options: ChainOptions) -> Array:
     """[14] log probability of each position; a person's word leaves no other."""
     evidence = position_evidence(believed(crown), jaw, options)
-    if said(crown):
+    if number_is_said(crown):
         evidence = np.where(evidence < evidence.max(), SAID_OTHERWISE, 0.0)
     return np.asarray(evidence)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
 from stages.dentition.crowns import mirrored_dentition
+from stages.dentition.tooth_rows import number_is_said
 from stages.init.dental.solution import ArchFit
 
 #: Places the photographs, with their teeth.
@@ -88,7 +89,7 @@ def turnings(fit: ArchFit, names: Sequence[str]) -> list[tuple[int, ...]]:
 
 def _is_said(dentition: Dentition) -> bool:
     """Has a person said how the photograph shows the patient's sides?"""
-    numbered = any(crown.number and crown.doubt == 0 for crown in dentition.all_crowns)
+    numbered = any(map(number_is_said, dentition.all_crowns))
     return dentition.mirrored is not None or numbered
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, is_primary, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.dentition.tooth_rows import NO_TOOTH, believed
+from stages.dentition.tooth_rows import NO_TOOTH, believed, number_is_said
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
 from stages.init.dental.template import tooth_at
 
@@ -133,5 +133,5 @@ def said_numbers(dentitions: list[Dentition]) -> dict[int, bool]:
         permanent_of(crown.number): is_primary(crown.number)
         for dentition in dentitions
         for crown in dentition.all_crowns
-        if crown.doubt == 0 and crown.number and crown.number % 10 <= 5
+        if number_is_said(crown) and crown.number % 10 <= 5
     }
