@@ -17,9 +17,11 @@ from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.rigid import exponential
 from pipeline.studies.register import comparing, movement, run_register, solving
+from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
-from pipeline.studies.register.estimate import Estimate
+from pipeline.studies.register.estimate import Estimate, started
 from pipeline.studies.register.frame import first_frame
+from pipeline.studies.register.geometry import inverted
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
 from tests.browser import needs_chromium, run_in
@@ -49,14 +51,14 @@ def found(motions: dict[int, np.ndarray], ways: list[Estimate]) -> comparing.Com
     frame = np.eye(4)
     frame[:3, :3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0]
     frame[:3, 3] = 20, -10, 5
-    estimated = comparing.estimate
+    estimated = comparing.both_ways
 
-    def kept(*visits_and_frame: Any) -> Estimate:
-        ways.append(estimated(*visits_and_frame))
-        return ways[-1]
+    def kept(*visits_and_frame: Any) -> tuple[Estimate, Estimate]:
+        ways[:] = estimated(*visits_and_frame)
+        return ways[0], ways[1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparing, "estimate", kept)
+        patch.setattr(comparing, "both_ways", kept)
         return compare_visits(toy_visit("first"), second.in_frame(frame))
 
 
@@ -90,8 +92,8 @@ def test_pictures_that_do_not_fit_widen_the_interval(
 ) -> None:
     """One way is enough: where a tooth's pictures hardly agree, its motion may be another one."""
     doubtful, (there, back) = 23, ways
-    doubted = iter([replace(there, fits={**there.fits, doubtful: 0.4}), back])
-    monkeypatch.setattr(comparing, "estimate", lambda *_: next(doubted))
+    doubted = replace(there, fits={**there.fits, doubtful: 0.4})
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: (doubted, back))
     plain = {t.tooth: t for t in found.teeth}
     for tooth in compare_visits(found.first, found.second).teeth:
         number, before = tooth.tooth, plain[tooth.tooth].deviation
@@ -100,6 +102,28 @@ def test_pictures_that_do_not_fit_widen_the_interval(
             wider = misfit(0.4) / misfit(min(way.fits[number] for way in ways))
             assert wider > 3
         assert tooth.deviation == pytest.approx(wider * before), number
+
+
+def test_what_one_way_lost_the_other_finds(motions: dict) -> None:
+    """The pictures of both choose, whichever way is lost, in each other's frame and scale."""
+    first = toy_visit("first")
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0], 20
+    second = toy_visit("second", motions, turn=3.0).in_frame(frame)
+    numbers = sorted(set(first.teeth) - set(motions))
+    there = started(first, second, inverted(frame), numbers)
+    back = started(second, first, frame, numbers)
+    lost = motion(there.centres[12], (1.4, 0.0, 0.0), (0.0, 0.0, 0.0))
+    astray = replace(there.state, motions={**there.state.motions, 12: lost})
+    kept, changed = agreed(replace(there, state=astray), back)[0], agreed(there, back)[0]
+    for found in (kept, changed):
+        off = solving.displacement(found.state.motions[12], found.centres[12])
+        off -= solving.displacement(motions[12], found.centres[12])
+        assert solving.travel(off) < 0.2
+    astray = replace(back.state, motions={**back.state.motions, 12: np.eye(4)})
+    found = agreed(there, replace(back, state=astray))[1]
+    again = mirrored(found.state.motions[12], inverted(frame))
+    assert np.allclose(again, there.state.motions[12], atol=1e-6)
 
 
 def test_half_of_the_interval_has_a_factor_and_a_floor_of_its_own_for_shifts_and_turns() -> None:

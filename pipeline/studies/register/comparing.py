@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ReconstructionError
 from pipeline.studies.register import solving
-from pipeline.studies.register.estimate import Estimate, estimate
+from pipeline.studies.register.both_ways import both_ways, mirrored
+from pipeline.studies.register.estimate import Estimate
 from pipeline.studies.register.frame import first_frame
 from pipeline.studies.register.geometry import inverted, refined_frame
 from pipeline.studies.register.movement import to_parts, tooth_axes
@@ -124,8 +125,7 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
         frame, agreeing = _frame(first, second)
     share = len(agreeing) / len(set(first.centres) & set(second.centres))
     frame = refined_frame(first, second, frame, agreeing)
-    there = estimate(first, second, frame, agreeing)
-    back = estimate(second, first, inverted(frame), agreeing)
+    there, back = both_ways(first, second, frame, agreeing)
     likeness = min(there.likeness, back.likeness)
     if likeness < LEAST_LIKENESS or share < LEAST_SHARE:
         raise ReconstructionError(
@@ -137,8 +137,8 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
             "at check.html of both workspaces: a wrong tooth number is the usual cause."
         )
     factor = "many" if min(len(first.looks), len(second.looks)) >= MANY else "few"
-    mirrored = _mirrored(back, there, BY_PHOTOGRAPH[factor])
-    teeth = tuple(_teeth(first, there, mirrored, back.fits, factor))
+    backwards = _mirrored(back, there, BY_PHOTOGRAPH[factor])
+    teeth = tuple(_teeth(first, there, backwards, back.fits, factor))
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
@@ -185,7 +185,6 @@ def _mirrored(
 ) -> dict[int, tuple[Array, Array]]:
     """What the way back says of each tooth, as a displacement [6] of the way there, covariance."""
     frame = inverted(back.first_from_second)  # first_from_second of the way there
-    inverse = np.linalg.inv(frame)
     scale = scale_of(frame)
     turn = np.zeros((6, 6))
     turn[:3, :3], turn[3:, 3:] = frame[:3, :3], frame[:3, :3] / scale
@@ -195,7 +194,7 @@ def _mirrored(
             continue
         centre = back.centres[number]
         motion = solving.moved_tooth(np.eye(4), displacement, centre)
-        same = frame @ np.linalg.inv(motion) @ inverse
+        same = mirrored(motion, frame)
         found[number] = (
             solving.displacement(same, there.centres[number]), turn @ covariance @ turn.T
         )  # fmt: skip

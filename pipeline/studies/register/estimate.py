@@ -19,7 +19,7 @@ from pipeline.studies.register.matching import (
     spots_between,
 )
 from pipeline.studies.register.movement import tooth_axes
-from pipeline.studies.register.photometric import FITS, searched
+from pipeline.studies.register.photometric import FITS, fits, searched
 from pipeline.studies.register.solving import Block, Pull, State
 from pipeline.studies.register.visit import Visit, in_frame
 
@@ -59,8 +59,6 @@ class Estimate:
         likeness: median correlation of the crowns' surroundings, at the end.
         residual: median distance of crowns from crowns, laid onto each other, mm.
         first_from_second: [4, 4] similarity of the two visits' frames.
-        seen: FDI number -> [4, 4] motion of a tooth that moved, by which its pictures fit better
-            than by `state` (see `photometric`).
         fits: FDI number -> correlation of the tooth's pictures by its motion, -1..1.
     """
 
@@ -73,22 +71,41 @@ class Estimate:
     likeness: float
     residual: float
     first_from_second: Array
-    seen: dict[int, Array] = field(default_factory=dict)
     fits: dict[int, float] = field(default_factory=dict)
 
 
-def estimate(
+@dataclass(frozen=True)
+class Started:
+    """Visits matched as long as it was open which teeth moved.
+
+    Attributes:
+        first, second: photographs of both visits.
+        state: motions of the first visit's teeth so far, and the second's cameras in its frame.
+        spots: the last that were found.
+        laid, centres, first_from_second: as in `Estimate`.
+    """
+
+    first: tuple[Prepared, ...]
+    second: tuple[Prepared, ...]
+    state: State
+    spots: tuple[Spots, ...]
+    laid: dict[int, Laid]
+    centres: dict[int, Array]
+    first_from_second: Array
+
+
+def started(
     first: Visit, second: Visit, first_from_second: Array, agreeing: Sequence[int]
-) -> Estimate:
-    """Find the motions of the first visit's teeth.
+) -> Started:
+    """Find about what the first visit's teeth did.
 
     Args:
         first, second: visits.
         first_from_second: [4, 4] similarity to begin with.
         agreeing: teeth that seem to have stood still, by that similarity.
     """
-    a = [prepare(look) for look in first.looks]
-    b = [prepare(look) for look in second.looks]
+    a = tuple(prepare(look) for look in first.looks)
+    b = tuple(prepare(look) for look in second.looks)
     centres = first.centres
     laid = calibrated(laid_crowns(first, second, first_from_second, agreeing), agreeing)
     state = State(
@@ -104,9 +121,16 @@ def estimate(
             state = _step(spots, state, centres, None, laid)
     # Flow is lost where it starts too far off: such teeth get another start.
     still = stood_still(state, centres, spots)
-    better, _ = searched(a, b, state, still, centres, tooth_axes(centres), PARTNERS, WIDEST)
-    started = {n: fit.motion for n, fit in better.items() if n not in still or fit.score >= FITS}
-    state = replace(state, motions={**state.motions, **started})
+    better = searched(a, b, state, still, centres, tooth_axes(centres), compared_pairs(a, state))
+    moved = {n: fit.motion for n, fit in better.items() if n not in still or fit.score >= FITS}
+    state = replace(state, motions={**state.motions, **moved})
+    return Started(a, b, state, tuple(spots), laid, centres, first_from_second)
+
+
+def finished(found: Started) -> Estimate:
+    """Fix the teeth that stood still and measure the others against them."""
+    a, b, state, centres, laid = found.first, found.second, found.state, found.centres, found.laid
+    spots = list(found.spots)
     factor = 1.0
     for _ in range(CLOSED_ROUNDS):
         still = stood_still(state, centres, spots)
@@ -115,12 +139,11 @@ def estimate(
             state = _step(spots, state, centres, still, laid)
         factor /= noise(spots, state, centres, still)
     blocks = [solving.block_of(s, state, centres[s.tooth]) for s in spots]
-    seen, fits = searched(a, b, state, still, centres, None, PARTNERS, WIDEST)
     likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
     return Estimate(
         state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
-        first_from_second, {n: fit.motion for n, fit in seen.items() if n not in still}, fits,
+        found.first_from_second, fits(a, b, state, compared_pairs(a, state)),
     )  # fmt: skip
 
 
@@ -147,14 +170,18 @@ def _start(laid: Laid | None, centre: Array) -> Array:
     return solving.moved_tooth(np.eye(4), likely, centre)
 
 
+def compared_pairs(a: Sequence[Prepared], state: State) -> list[tuple[int, int]]:
+    """Which photographs of the first visit are compared with which of the second."""
+    return pairs_of([p.look.camera for p in a], list(state.cameras), PARTNERS, WIDEST)
+
+
 def match(
     a: Sequence[Prepared], b: Sequence[Prepared], state: State,
     between: Callable[..., list[Spots]] = spots_between,
 ) -> list[Spots]:  # fmt: skip
     """The spots of all pairs of photographs."""
     found: list[Spots] = []
-    pairs = pairs_of([p.look.camera for p in a], list(state.cameras), PARTNERS, WIDEST)
-    for i, j in pairs:
+    for i, j in compared_pairs(a, state):
         found += between(a[i], b[j], state.cameras[j], state.motions, i, j)
     total: dict[int, int] = {}
     for spots in found:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.studies.register import solving
-from pipeline.studies.register.matching import Prepared, Spots, pairs_of
+from pipeline.studies.register.matching import Prepared, Spots
 from pipeline.studies.register.solving import State
 from pipeline.studies.register.visit import Floats
 
@@ -210,38 +210,46 @@ def best_motion(views: Sequence[Facing], now: Array, centre: Array, axes: Array)
 
 def searched(
     first: Sequence[Prepared], second: Sequence[Prepared], state: State, still: Sequence[int],
-    centres: Mapping[int, Array], axes: Mapping[int, Array] | None, partners: int, widest: float,
-) -> tuple[dict[int, Fit], dict[int, float]]:  # fmt: skip
-    """Better motions, by FDI number, of teeth whose pictures fit better with one; and how well the
-    pictures of every tooth fit (-1..1), with that or as it is.
+    centres: Mapping[int, Array], axes: Mapping[int, Array], pairs: Sequence[tuple[int, int]],
+) -> dict[int, Fit]:  # fmt: skip
+    """Better motions, by FDI number, of teeth whose pictures fit better with one.
 
     Args:
         first, second: photographs of both visits.
         state: motions to begin with, and the second visit's cameras, which stay.
         still: teeth that seem to have stood still: these need a bad fit to be tried at all, and
             other starts must fit clearly better.
-        centres: of all teeth. axes: of all teeth (see `movement.tooth_axes`), to try other starts;
-            None: motions are only improved.
-        partners, widest: which photographs are compared (`matching.pairs_of`).
+        centres: of all teeth. axes: of all teeth (see `movement.tooth_axes`).
+        pairs: which photographs are compared (see `matching.pairs_of`).
     """
     a, b = Pictures(first), Pictures(second)
-    pairs = pairs_of([p.look.camera for p in first], list(state.cameras), partners, widest)
-    found, likeness = {}, {}
+    found = {}
     for tooth in sorted(state.motions):
         views = facings(tooth, a, b, state, pairs)
-        if not views:
-            continue
         now = state.motions[tooth]
-        fits = likeness[tooth] = score(views, FINE, now)
-        if tooth in still and (fits >= FITS or axes is None):
+        fit = score(views, FINE, now)
+        if not views or (tooth in still and fit >= FITS):
             continue
         best = improved(views, now, centres[tooth])
         # Another start has to be clearly better than the nearest motion, or a bad fit is traded
         # for another one.
-        if axes is not None and best.score < FITS:
+        if best.score < FITS:
             other = best_motion(views, now, centres[tooth], axes[tooth])
             best = other if other.score > best.score + CLEARLY else best
-        if best.score > fits + (CLEARLY if tooth in still else 0.0):
+        if best.score > fit + (CLEARLY if tooth in still else 0.0):
             found[tooth] = best
-            likeness[tooth] = best.score
-    return found, likeness
+    return found
+
+
+def fits(
+    first: Sequence[Prepared], second: Sequence[Prepared], state: State,
+    pairs: Sequence[tuple[int, int]],
+) -> dict[int, float]:  # fmt: skip
+    """FDI number -> correlation of the tooth's pictures by its motion, -1..1."""
+    a, b = Pictures(first), Pictures(second)
+    found = {}
+    for tooth, motion in sorted(state.motions.items()):
+        views = facings(tooth, a, b, state, pairs)
+        if views:
+            found[tooth] = score(views, FINE, motion)
+    return found

@@ -1,0 +1,99 @@
+"""What teeth did as two comparisons say it: from the first visit to the second, and back.
+
+Optical flow that starts too far off is lost, and mostly one way only. Where both ways say that a
+tooth did something else, the pictures of both choose before either is brought to its end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.studies.register import solving
+from pipeline.studies.register.estimate import (
+    CLEAR,
+    Estimate,
+    Started,
+    compared_pairs,
+    finished,
+    started,
+)
+from pipeline.studies.register.geometry import inverted
+from pipeline.studies.register.photometric import FINE, Pictures, facings, score
+from pipeline.studies.register.visit import Visit
+
+Array = npt.NDArray[np.float64]
+
+
+def both_ways(
+    first: Visit, second: Visit, first_from_second: Array, agreeing: Sequence[int]
+) -> tuple[Estimate, Estimate]:
+    """The motions from the first visit to the second, and from the second to the first.
+
+    Args:
+        first, second: visits.
+        first_from_second: [4, 4] similarity to begin with.
+        agreeing: teeth that seem to have stood still, by that similarity.
+    """
+    there = started(first, second, first_from_second, agreeing)
+    back = started(second, first, inverted(first_from_second), agreeing)
+    there, back = agreed(there, back)
+    return finished(there), finished(back)
+
+
+def mirrored(motion: Array, frame: Array) -> Array:
+    """[4, 4] what a motion of the way back is on the way there.
+
+    Args:
+        motion: [4, 4] of a tooth of the second visit, in its frame.
+        frame: [4, 4] similarity from the second visit's frame to the first's.
+    """
+    return np.asarray(frame @ np.linalg.inv(motion) @ np.linalg.inv(frame), np.float64)
+
+
+def agreed(there: Started, back: Started) -> tuple[Started, Started]:
+    """Both ways, each tooth with the motion by which the pictures of both fit better.
+
+    Teeth on whose motion they agree (within `estimate.CLEAR`) keep what either says.
+    """
+    to_first, to_second = there.first_from_second, inverted(there.first_from_second)
+    ways = [_Way(there), _Way(back)]
+    forwards, backwards = dict(there.state.motions), dict(back.state.motions)
+    for n in sorted(set(forwards) & set(backwards)):
+        other = mirrored(backwards[n], to_first)
+        if _apart(forwards[n], other, there.centres[n]) < CLEAR:
+            continue
+        own = mirrored(forwards[n], to_second)
+        if ways[0].fit(n, forwards[n]) + ways[1].fit(n, own) >= (
+            ways[0].fit(n, other) + ways[1].fit(n, backwards[n])
+        ):
+            backwards[n] = own
+        else:
+            forwards[n] = other
+    return (
+        replace(there, state=replace(there.state, motions=forwards)),
+        replace(back, state=replace(back.state, motions=backwards)),
+    )
+
+
+def _apart(one: Array, other: Array, centre: Array) -> float:
+    """How far two motions [4, 4] of a crown with this centre [3] are from each other, mm."""
+    reached = other[:3, :3] @ centre + other[:3, 3]
+    return solving.travel(solving.displacement(one @ np.linalg.inv(other), reached))
+
+
+class _Way:
+    """One way's pictures, made once."""
+
+    def __init__(self, found: Started) -> None:
+        self.state = found.state
+        self.pictures = Pictures(found.first), Pictures(found.second)
+        self.pairs = compared_pairs(found.first, found.state)
+
+    def fit(self, tooth: int, motion: Array) -> float:
+        """Correlation of a tooth's pictures by a motion [4, 4], -1..1."""
+        state = replace(self.state, motions={**self.state.motions, tooth: motion})
+        return score(facings(tooth, *self.pictures, state, self.pairs), FINE, motion)
