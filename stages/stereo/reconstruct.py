@@ -199,7 +199,7 @@ def _sweep_view(
         if level:
             finer = pyramids[index][level - 1].gray.shape
             found = plane / np.float32(number - 1)
-            ranges = ranges_around(found, finer, planes_at(level - 1, planes))
+            ranges = ranges_around(found, own.usable, finer, planes_at(level - 1, planes))
     # The first and the last plane stand for all that lies beyond the range.
     ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc).astype(np.float32)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)

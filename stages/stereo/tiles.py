@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 Array = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
@@ -17,6 +16,9 @@ TILE = (16, 28)
 MARGIN = 4
 #: Pixels of the coarser level around a tile that are asked too.
 RING = 2
+#: Share of these at either end that don't count: single pixels that went astray would have all of
+#: the tile look everywhere.
+STRAY = 0.02
 
 
 class Buffer:
@@ -44,12 +46,15 @@ def full_ranges(shape: tuple[int, int], planes: int) -> Integers:
     return np.tile(np.array([0, planes], np.int64), (down * across, 1))
 
 
-def ranges_around(position: Array, shape: tuple[int, int], planes: int) -> Integers:
+def ranges_around(
+    position: Array, usable: npt.NDArray[np.bool_], shape: tuple[int, int], planes: int
+) -> Integers:
     """The planes near those that a coarser level decided for.
 
     Args:
         position: [h, w] float32, of each pixel of the coarser level, where it lies between the
             first plane (0) and the last (1).
+        usable: [h, w] bool, where that counts; where no pixel of a tile does, all of them do.
         shape: (H, W) of the image.
         planes: of the image.
 
@@ -57,16 +62,22 @@ def ranges_around(position: Array, shape: tuple[int, int], planes: int) -> Integ
         [T, 2] int64 for every tile of the image, row by row, its first plane and the one after its
         last.
     """
-    size = 2 * RING + 1
-    least = ndimage.minimum_filter(position, size, mode="nearest")
-    most = ndimage.maximum_filter(position, size, mode="nearest")
     down, across = tile_grid(shape)
     ranges = np.empty((down * across, 2), np.int64)
     high, wide = position.shape
     for tile in range(down * across):
         y, x = tile // across * TILE[0], tile % across * TILE[1]
-        rows = slice(y * high // shape[0], -(-(min(y + TILE[0], shape[0]) * high) // shape[0]))
-        columns = slice(x * wide // shape[1], -(-(min(x + TILE[1], shape[1]) * wide) // shape[1]))
-        ranges[tile, 0] = np.floor(least[rows, columns].min() * (planes - 1)) - MARGIN
-        ranges[tile, 1] = np.ceil(most[rows, columns].max() * (planes - 1)) + MARGIN + 1
+        rows = _around(y, min(y + TILE[0], shape[0]), high, shape[0])
+        columns = _around(x, min(x + TILE[1], shape[1]), wide, shape[1])
+        found = position[rows, columns]
+        some = usable[rows, columns]
+        values = np.sort(found[some] if some.any() else found, axis=None)
+        stray = int(STRAY * len(values))
+        ranges[tile, 0] = np.floor(values[stray] * (planes - 1)) - MARGIN
+        ranges[tile, 1] = np.ceil(values[-1 - stray] * (planes - 1)) + MARGIN + 1
     return np.clip(ranges, [0, 1], [planes - 1, planes])
+
+
+def _around(first: int, end: int, coarse: int, fine: int) -> slice:
+    """The pixels of a coarser image that show those of a finer one, and `RING` more."""
+    return slice(max(first * coarse // fine - RING, 0), -(-(end * coarse) // fine) + RING)

@@ -334,7 +334,7 @@ def test_ranges_hold_what_the_coarser_level_found():
     position = np.linspace(0, 1, shape[1] // 2, dtype=np.float32) * np.ones(
         (shape[0] // 2, 1), np.float32
     )
-    ranges = ranges_around(position, shape, planes)
+    ranges = ranges_around(position, np.ones(position.shape, bool), shape, planes)
     assert ranges.shape == (down * across, 2) == full_ranges(shape, planes).shape
     assert (ranges[:, 0] >= 0).all() and (ranges[:, 1] <= planes).all()
     for x in range(shape[1]):
@@ -342,6 +342,20 @@ def test_ranges_hold_what_the_coarser_level_found():
         low, high = ranges[x // TILE[1]]
         assert low <= plane < high
     assert (ranges[0::across, 1] < planes).all()  # the left ones don't look at the far end
+
+
+def test_what_is_not_used_or_went_astray_alone_widens_no_range():
+    shape, planes = (2 * TILE[0], 2 * TILE[1]), 100
+    position = np.full((shape[0] // 2, shape[1] // 2), 0.5, np.float32)
+    usable = np.ones(position.shape, bool)
+    plain = ranges_around(position, usable, shape, planes)
+    disturbed, seen = position.copy(), usable.copy()
+    disturbed[2, 3], disturbed[5, 7] = 0, 1
+    disturbed[:, -5:], seen[:, -5:] = 0.9, False
+    np.testing.assert_array_equal(ranges_around(disturbed, seen, shape, planes), plain)
+    seen[:] = False  # nothing is known: everything that was found counts
+    ranges = ranges_around(disturbed, seen, shape, planes)
+    assert ranges[1, 1] > 0.9 * planes > plain[1, 1]
 
 
 def test_costs_inside_a_range_are_those_of_the_full_sweep():
