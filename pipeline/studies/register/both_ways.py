@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,15 @@ from pipeline.studies.register.estimate import (
     started,
 )
 from pipeline.studies.register.geometry import inverted
-from pipeline.studies.register.photometric import FINE, Pictures, facings, score
+from pipeline.studies.register.photometric import (
+    CLEARLY,
+    FINE,
+    LEAST_PHOTOGRAPHS,
+    Pictures,
+    facings,
+    photographs,
+    score,
+)
 from pipeline.studies.register.visit import Visit
 
 Array = npt.NDArray[np.float64]
@@ -55,9 +64,10 @@ def mirrored(motion: Array, frame: Array) -> Array:
 
 
 def agreed(there: Started, back: Started) -> tuple[Started, Started]:
-    """Both ways, each tooth with the motion by which the pictures of both fit better.
+    """Both ways, each tooth with the motion by which the pictures of both fit clearly better.
 
-    Teeth on whose motion they agree (within `estimate.CLEAR`) keep what either says.
+    Where they agree (within `estimate.CLEAR`), where few photographs show the tooth, or where the
+    pictures do not decide, each keeps what it says: what they differ by tells how sure they are.
     """
     to_first, to_second = there.first_from_second, inverted(there.first_from_second)
     ways = [_Way(there), _Way(back)]
@@ -67,11 +77,16 @@ def agreed(there: Started, back: Started) -> tuple[Started, Started]:
         if _apart(forwards[n], other, there.centres[n]) < CLEAR:
             continue
         own = mirrored(forwards[n], to_second)
-        if ways[0].fit(n, forwards[n]) + ways[1].fit(n, own) >= (
-            ways[0].fit(n, other) + ways[1].fit(n, backwards[n])
-        ):
+        fits = (
+            ways[0].fit(n, forwards[n]), ways[1].fit(n, own),
+            ways[0].fit(n, other), ways[1].fit(n, backwards[n]),
+        )  # fmt: skip
+        if min(fit.photographs for fit in fits) < LEAST_PHOTOGRAPHS:
+            continue
+        better = fits[0].score + fits[1].score - fits[2].score - fits[3].score
+        if better > 2 * CLEARLY:
             backwards[n] = own
-        else:
+        elif better < -2 * CLEARLY:
             forwards[n] = other
     return (
         replace(there, state=replace(there.state, motions=forwards)),
@@ -85,6 +100,13 @@ def _apart(one: Array, other: Array, centre: Array) -> float:
     return solving.travel(solving.displacement(one @ np.linalg.inv(other), reached))
 
 
+class _Fit(NamedTuple):
+    """Correlation of a tooth's pictures, -1..1, and how many photographs of a visit show it."""
+
+    score: float
+    photographs: int
+
+
 class _Way:
     """One way's pictures, made once."""
 
@@ -93,7 +115,8 @@ class _Way:
         self.pictures = Pictures(found.first), Pictures(found.second)
         self.pairs = compared_pairs(found.first, found.state)
 
-    def fit(self, tooth: int, motion: Array) -> float:
-        """Correlation of a tooth's pictures by a motion [4, 4], -1..1."""
+    def fit(self, tooth: int, motion: Array) -> _Fit:
+        """How well a tooth's pictures fit by a motion [4, 4]."""
         state = replace(self.state, motions={**self.state.motions, tooth: motion})
-        return score(facings(tooth, *self.pictures, state, self.pairs), FINE, motion)
+        views = facings(tooth, *self.pictures, state, self.pairs)
+        return _Fit(score(views, FINE, motion), photographs(views))

@@ -19,7 +19,7 @@ from pipeline.studies.register.matching import (
     spots_between,
 )
 from pipeline.studies.register.movement import tooth_axes
-from pipeline.studies.register.photometric import FITS, fits, searched
+from pipeline.studies.register.photometric import FITS, judged, searched
 from pipeline.studies.register.solving import Block, Pull, State
 from pipeline.studies.register.visit import Visit, in_frame
 
@@ -59,6 +59,8 @@ class Estimate:
         likeness: median correlation of the crowns' surroundings, at the end.
         residual: median distance of crowns from crowns, laid onto each other, mm.
         first_from_second: [4, 4] similarity of the two visits' frames.
+        seen: FDI number -> [4, 4] motion of a tooth that moved, by which its few pictures fit
+            better than by `state` (see `photometric.judged`).
         fits: FDI number -> correlation of the tooth's pictures by its motion, -1..1.
     """
 
@@ -71,6 +73,7 @@ class Estimate:
     likeness: float
     residual: float
     first_from_second: Array
+    seen: dict[int, Array] = field(default_factory=dict)
     fits: dict[int, float] = field(default_factory=dict)
 
 
@@ -139,11 +142,12 @@ def finished(found: Started) -> Estimate:
             state = _step(spots, state, centres, still, laid)
         factor /= noise(spots, state, centres, still)
     blocks = [solving.block_of(s, state, centres[s.tooth]) for s in spots]
+    seen, fits = judged(a, b, state, still, centres, compared_pairs(a, state))
     likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
     return Estimate(
         state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
-        found.first_from_second, fits(a, b, state, compared_pairs(a, state)),
+        found.first_from_second, seen, fits,
     )  # fmt: skip
 
 

@@ -38,6 +38,9 @@ FINE = len(COARSE_TO_FINE) - 1
 POINTS, LEAST, PAIRS = 250, 40, 12
 #: So many points side by side say the same: contrast reaches over several pixels.
 ALIKE = 10.0
+#: From so many photographs of a visit on a tooth's pictures are not few: what two or three show (a
+#: last molar) a wrong motion may fit as well as the true one.
+LEAST_PHOTOGRAPHS = 4
 #: What a tooth does between two visits: 1 mm, 6 degrees (standard deviations).
 PRIOR = np.diag([1.0] * 3 + [1 / np.radians(6.0) ** 2] * 3)
 
@@ -121,6 +124,11 @@ def facings(
         found.append(Facing(points[kept], values, b.made[j], theirs, clear, camera))
         sizes.append(int(crown.sum()))
     return [found[k] for k in np.argsort(sizes, kind="stable")[::-1][:PAIRS]]
+
+
+def photographs(views: Sequence[Facing]) -> int:
+    """How many photographs of the second visit these are."""
+    return len({facing.camera.name for facing in views})
 
 
 def _sampled(facing: Facing, level: int, motion: Array) -> tuple[Array, Array, Array, Array]:
@@ -241,15 +249,30 @@ def searched(
     return found
 
 
-def fits(
-    first: Sequence[Prepared], second: Sequence[Prepared], state: State,
-    pairs: Sequence[tuple[int, int]],
-) -> dict[int, float]:  # fmt: skip
-    """FDI number -> correlation of the tooth's pictures by its motion, -1..1."""
+def judged(
+    first: Sequence[Prepared], second: Sequence[Prepared], state: State, still: Sequence[int],
+    centres: Mapping[int, Array], pairs: Sequence[tuple[int, int]],
+) -> tuple[dict[int, Array], dict[int, float]]:  # fmt: skip
+    """Better motions [4, 4], by FDI number, of teeth that few photographs show, and how well the
+    pictures of every tooth fit (-1..1), with that or as it is.
+
+    With more photographs optical flow is right on the mean, while contrast takes the light that
+    stays for a tooth that did not turn.
+
+    Args:
+        first, second, state, centres, pairs: as for `searched`.
+        still: teeth that stood still; their motion stays.
+    """
     a, b = Pictures(first), Pictures(second)
-    found = {}
+    better, likeness = {}, {}
     for tooth, motion in sorted(state.motions.items()):
         views = facings(tooth, a, b, state, pairs)
-        if views:
-            found[tooth] = score(views, FINE, motion)
-    return found
+        if not views:
+            continue
+        likeness[tooth] = score(views, FINE, motion)
+        if tooth in still or photographs(views) >= LEAST_PHOTOGRAPHS:
+            continue
+        best = improved(views, motion, centres[tooth])
+        if best.score > likeness[tooth]:
+            better[tooth], likeness[tooth] = best.motion, best.score
+    return better, likeness

@@ -76,5 +76,10 @@ def measured(found: Estimate, by_photograph: float = 1.0) -> dict[int, tuple[Arr
                     off = np.array([s[n] for s in sample]) - whole[n]
                     # A photograph that does not show the tooth says nothing of it.
                     covariance += counts * (len(sample) - 1) / len(sample) * off.T @ off
-            result[n] = whole[n], np.asarray(covariance, np.float64)
+            best = whole[n]
+            if n in found.seen:  # what flow says differs from what the pictures say: doubt
+                best = solving.displacement(found.seen[n], found.centres[n])
+                half = (best - whole[n]) / 2
+                covariance += np.outer(half, half)
+            result[n] = best, np.asarray(covariance, np.float64)
     return result
