@@ -109,14 +109,10 @@ class FlowStage(Stage):
         return PARTS
 
     def run(self, context: StageContext) -> None:
-        import cv2
+        from pipeline.kernels.threads import one_opencv_thread
 
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)  # cheap insurance: the bytes must not depend on OpenCV's threads
-        try:
+        with one_opencv_thread():
             _run(context)
-        finally:
-            cv2.setNumThreads(threads)
 
 
 def _run(context: StageContext) -> None:

@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 
 from pipeline.artifacts.views import View
+from pipeline.kernels.threads import one_opencv_thread
 from stages.teeth.read import (
     Glances,
     Reading,
@@ -92,13 +92,8 @@ class PhotographReader:
     @contextmanager
     def _side_by_side(self) -> Iterator[Map]:
         """Map over photographs in threads, OpenCV keeping to one in each."""
-        before = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            with ThreadPoolExecutor(self._threads) as pool:
-                yield pool.map
-        finally:
-            cv2.setNumThreads(before)
+        with one_opencv_thread(), ThreadPoolExecutor(self._threads) as pool:
+            yield pool.map
 
 
 def read_photographs(views: Sequence[View], threads: int, progress: Progress) -> list[Reading]:

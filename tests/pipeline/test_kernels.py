@@ -8,11 +8,13 @@ import sys
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.kernels import cache, folder, kernel, kernel_threads, news, rehearsals
 from pipeline.kernels import each as each_piece
+from pipeline.kernels.threads import in_threads, one_opencv_thread
 
 ROOT = Path(__file__).resolve().parents[2]
 KERNELS = """
@@ -204,3 +206,23 @@ class TestRehearsals:
         assert len(processes) == 2
         background.stop()
         assert all(process.poll() is not None for process in processes)
+
+
+def test_opencv_has_its_threads_back_whatever_happened():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        with one_opencv_thread():
+            assert cv2.getNumThreads() == 1
+        assert cv2.getNumThreads() == 3
+        with pytest.raises(KeyError), one_opencv_thread():
+            raise KeyError
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
+
+
+def test_what_threads_find_comes_in_the_order_of_the_items():
+    done = []
+    assert in_threads(lambda k: k * k, range(7), 3, done.append) == [k * k for k in range(7)]
+    assert done == list(range(1, 8))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels.threads import one_opencv_thread
 from pipeline.studies.register import solving
 from pipeline.studies.register.estimate import (
     CLEAR,
@@ -47,10 +48,11 @@ def both_ways(
         first_from_second: [4, 4] similarity to begin with.
         agreeing: teeth that seem to have stood still, by that similarity.
     """
-    there = started(first, second, first_from_second, agreeing)
-    back = started(second, first, inverted(first_from_second), agreeing)
-    there, back = agreed(there, back)
-    return finished(there), finished(back)
+    with one_opencv_thread():
+        there = started(first, second, first_from_second, agreeing)
+        back = started(second, first, inverted(first_from_second), agreeing)
+        there, back = agreed(there, back)
+        return finished(there), finished(back)
 
 
 def mirrored(motion: Array, frame: Array) -> Array:

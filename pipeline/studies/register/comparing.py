@@ -23,14 +23,13 @@ Array = npt.NDArray[np.float64]
 
 #: Half of a 95 % interval in standard deviations (of a shift's parts, of a turn's), with fewer than
 #: six photographs and with more; and what it never falls below: shifts (mm), tip and torque, and
-#: rotation (degrees). Chosen
-#: on generated mouths so that a tooth's shift and its turn are both covered in 95 % of the teeth,
-#: of those that moved alone as well, and so are 95 % of the parts: benchmarks/register.py
-#: --calibrate. Turns have a high floor: what shading does to all photographs alike shows in none
-#: of the jackknives. Of three photographs, rotation is the least sure: crowns are
-#: round about their length, so that their shape does not tell it.
-FACTORS = {"few": (1.7, 1.4), "many": (3.0, 3.0)}
-FLOORS = {"few": (0.15, 4.0, 6.0), "many": (0.08, 3.0, 3.0)}
+#: rotation (degrees). Chosen on generated mouths so that a tooth's shift and its turn are both
+#: covered in 95 % of the teeth, of those that moved alone as well, and so are 95 % of the parts:
+#: benchmarks/register.py --calibrate. With many photographs turns have a large factor: what shading
+#: does to all of them alike shows in none of the jackknives. Of three photographs, rotation is the
+#: least sure: crowns are round about their length, so that their shape does not tell it.
+FACTORS = {"few": (1.7, 1.4), "many": (2.0, 5.5)}
+FLOORS = {"few": (0.15, 4.0, 6.0), "many": (0.1, 0.5, 0.75)}
 MANY = 6
 #: Share of the jackknife over photographs that counts. Of few photographs mostly one or two show a
 #: tooth: without them the estimate falls back to no motion, so that the jackknife says how far the

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels.threads import in_threads
+from pipeline.measure import usable_cores
 from pipeline.studies.register import solving
 from pipeline.studies.register.geometry import Laid, laid_crowns
 from pipeline.studies.register.matching import (
@@ -184,9 +187,12 @@ def match(
     between: Callable[..., list[Spots]] = spots_between,
 ) -> list[Spots]:  # fmt: skip
     """The spots of all pairs of photographs."""
-    found: list[Spots] = []
-    for i, j in compared_pairs(a, state):
-        found += between(a[i], b[j], state.cameras[j], state.motions, i, j)
+
+    def of(pair: tuple[int, int]) -> list[Spots]:
+        i, j = pair
+        return between(a[i], b[j], state.cameras[j], state.motions, i, j)
+
+    found = list(chain(*in_threads(of, compared_pairs(a, state), usable_cores())))
     total: dict[int, int] = {}
     for spots in found:
         total[spots.tooth] = total.get(spots.tooth, 0) + len(spots.points)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import is_upper
+from pipeline.kernels.threads import one_opencv_thread
 from stages.init.dental.cameras.bundle import Adjusted, Matches
 from stages.init.dental.template import GUM_STEPS, landmark_names
 
@@ -309,12 +310,8 @@ def dense_matches(
     weights: list[float] = []
     deviations: list[float] = []
     figures: dict[tuple[int, int], PairFigures] = {}
-    opencv_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # the flow works in stripes, as many as there are threads
-    try:
+    with one_opencv_thread():
         found = [flow_matches(charts[i], charts[j], scale) for i, j in pairs]
-    finally:
-        cv2.setNumThreads(opencv_threads)
     for (i, j), (pixels, share) in zip(pairs, found, strict=True):
         band = (photos[i].band + photos[j].band) / 2
         error = np.nan
