@@ -74,9 +74,8 @@ def write_colmap(
     tracks: dict[int, Any] = {int(point): pycolmap.Track() for point in np.flatnonzero(kept)}
     for image_id, (index, pixels) in enumerate(seen, start=1):
         used = kept[index]
-        model.image(image_id).points2D = pycolmap.Point2DList(
-            [pycolmap.Point2D(pixel) for pixel in pixels[used]]
-        )
+        # An image made from the pixels as one array makes the list without a loop in Python.
+        model.image(image_id).points2D = pycolmap.Image(keypoints=pixels[used]).points2D
         for place, point in enumerate(index[used].tolist()):
             tracks[point].add_element(image_id, place)
     for point, track in tracks.items():
