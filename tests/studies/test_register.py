@@ -19,9 +19,10 @@ from pipeline.geometry.rigid import exponential
 from pipeline.studies.register import comparing, movement, run_register, solving
 from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
-from pipeline.studies.register.estimate import Estimate, Started, started
+from pipeline.studies.register.estimate import Estimate, Started, compared_pairs, started
 from pipeline.studies.register.frame import first_frame
 from pipeline.studies.register.geometry import inverted
+from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
 from tests.browser import needs_chromium, run_in
@@ -126,6 +127,30 @@ def test_what_one_way_lost_the_other_finds(motions: dict) -> None:
     assert found.state.motions[12] is there.state.motions[12]
     again = mirrored(mended.state.motions[12], inverted(frame))
     assert np.allclose(again, there.state.motions[12], atol=1e-6)
+
+
+def test_contrast_itself_improves_what_few_photographs_show(motions: dict) -> None:
+    """And nothing else: not what four photographs show, not a tooth that stood still."""
+    first, second = toy_visit("first"), toy_visit("second", motions, turn=3.0)
+    still = sorted(set(first.teeth) - set(motions))
+    for count in (3, 4):
+        seen = [replace(visit, looks=visit.looks[:count]) for visit in (first, second)]
+        way = started(seen[0], seen[1], np.eye(4), still)
+        shift = np.eye(4)
+        shift[:3, 3] = 0.15, 0.15, 0
+        way = with_motion(with_motion(way, 12, shift @ motions[12]), 11, shift)
+        better, fits = judged(
+            way.first, way.second, way.state, still, way.centres,
+            compared_pairs(way.first, way.state),
+        )  # fmt: skip
+        assert (12 in better) == (count == 3)
+        assert not set(better) & set(still)
+        assert set(fits) >= {11, 12, 21}
+        if count == 3:
+            true, centre = solving.displacement(motions[12], way.centres[12]), way.centres[12]
+            off = solving.displacement(better[12], centre) - true
+            assert solving.travel(off) < 0.1
+            assert fits[12] > 0.8
 
 
 def with_motion(found: Started, tooth: int, motion: np.ndarray) -> Started:
