@@ -23,7 +23,7 @@ browsers: system chromium .venv/installed-dev
 	@tools/system-packages browsers
 	for engine in firefox webkit; do \
 	    PAGES_IN=$$engine xvfb-run -a -s "-screen 0 1600x1200x24" $(BIN)/python -m pytest \
-	        tests/stages/test_viewer_tools.py tests/studies/test_register.py || exit 1; \
+	        tests/stages/test_viewer_tools.py tests/studies/test_register_command.py || exit 1; \
 	done
 
 lint: .venv/installed-dev

@@ -24,6 +24,11 @@ UPPER = (15, 14, 13, 12, 11, 21, 22, 23, 24, 25)
 #: Every second pixel becomes a Gaussian.
 QUINCUNX = np.eye(2, dtype=bool)
 LOWER = (45, 44, 43, 42, 41, 31, 32, 33, 34, 35)
+#: Teeth that moved between the visits: mm, degrees (rotation vector).
+MOVED = {
+    12: ((0.5, 0.2, 0.4), (3.0, -4.0, 2.0)),
+    34: ((-0.2, 0.6, 0.3), (0.0, 5.0, 0.0)),
+}
 
 
 def toy_centres() -> dict[int, np.ndarray]:
@@ -118,6 +123,12 @@ def motion(centre: np.ndarray, shift: tuple[float, ...], turn: tuple[float, ...]
     matrix[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
     matrix[:3, 3] = centre + shift - matrix[:3, :3] @ centre
     return matrix
+
+
+def toy_motions() -> dict[int, np.ndarray]:
+    """FDI number -> [4, 4] what the moved teeth did."""
+    centres = toy_centres()
+    return {number: motion(centres[number], *how) for number, how in MOVED.items()}
 
 
 def write_visit(workspace: Path, visit: Visit) -> Path:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.rigid import exponential
-from pipeline.studies.register import comparing, movement, run_register, solving
+from pipeline.studies.register import comparing, movement, solving
 from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
 from pipeline.studies.register.estimate import Estimate, Started, compared_pairs, started
@@ -25,19 +19,12 @@ from pipeline.studies.register.geometry import inverted
 from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
-from tests.browser import needs_chromium, run_in
-from tests.studies.register_case import motion, toy_centres, toy_visit, write_visit
-
-MOVED = {
-    12: ((0.5, 0.2, 0.4), (3.0, -4.0, 2.0)),
-    34: ((-0.2, 0.6, 0.3), (0.0, 5.0, 0.0)),
-}
+from tests.studies.register_case import motion, toy_centres, toy_motions, toy_visit
 
 
 @pytest.fixture(scope="module")
 def motions() -> dict[int, np.ndarray]:
-    centres = toy_centres()
-    return {n: motion(centres[n], *how) for n, how in MOVED.items()}
+    return toy_motions()
 
 
 @pytest.fixture(scope="module")
@@ -274,195 +261,3 @@ def test_textbook_teeth_give_a_scale() -> None:
     assert textbook_scale(front) == pytest.approx(2.0)
     with pytest.raises(RequestError, match="neighbouring"):
         textbook_scale({11: np.zeros(3), 16: np.ones(3)})
-
-
-@pytest.fixture(scope="module")
-def workspaces(tmp_path_factory: pytest.TempPathFactory, motions: dict) -> tuple[Path, Path]:
-    home = tmp_path_factory.mktemp("visits")
-    return (
-        write_visit(home / "may", toy_visit("first")),
-        write_visit(home / "june", toy_visit("second", motions, turn=3.0)),
-    )
-
-
-@pytest.fixture(scope="module")
-def written(
-    workspaces: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Result]:
-    """The folder that the command writes, and how it ended."""
-    out = tmp_path_factory.mktemp("written") / "out"
-    return out, CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
-
-
-def test_the_command_writes_table_page_and_mesh(
-    written: tuple[Path, Result], motions: dict[int, np.ndarray]
-) -> None:
-    out, result = written
-    assert result.exit_code == 0, result.output
-    assert "12: " in result.output
-    size = (out / "register.html").stat().st_size
-    assert f"register.html ({size / 1e6:.1f} MB)" in result.stdout
-    assert "register: starts" in result.stderr and "register: done in" in result.stderr
-    assert "peak memory" not in result.stderr
-    said = json.loads((out / "register.json").read_text())
-    assert {t["fdi"] for t in said["teeth"] if t["moved"]} == set(MOVED)
-    with (out / "movements.csv").open() as stream:
-        rows = {int(row["fdi"]): row for row in csv.DictReader(stream)}
-    assert rows[12]["moved"] == "yes"
-    at = next(np.array(t["at"]) for t in said["teeth"] if t["fdi"] == 12)
-    true = np.linalg.norm(solving.displacement(motions[12], at)[:3])
-    assert float(rows[12]["distance_mm"]) == pytest.approx(true, abs=0.15)
-    page = (out / "register.html").read_text()
-    assert page.count("data:image/jpeg") == 9
-    assert "http" not in page.replace("http-equiv", "")
-    assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
-
-
-@pytest.mark.parametrize("how", ["-q", "-v"])
-def test_the_command_says_nothing_or_each_step(
-    workspaces: tuple[Path, Path], tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch,
-    found: comparing.Comparison,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(comparing, "compare_visits", lambda first, second: found)
-    monkeypatch.setattr("pipeline.front.progress.time.monotonic", iter(range(10_000)).__next__)
-    out = str(tmp_path / "out")
-    result = CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", out, how])
-    assert result.exit_code == 0, result.output
-    if how == "-q":
-        assert result.output == ""
-    else:
-        for text in (f"read {workspaces[1]} 1/4", "compare the teeth 2/4", "peak memory mb"):
-            assert text in result.stderr, text
-    assert (Path(out) / "register.html").exists()
-
-
-def test_no_workspace_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match="not a workspace"):
-        run_register(workspaces[0], tmp_path)
-
-
-def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
-    half = tmp_path / "half"
-    half.mkdir()
-    (half / "request.json").write_text((workspaces[0] / "request.json").read_text())
-    with pytest.raises(RequestError, match="finish the run first"):
-        run_register(half, workspaces[1])
-
-
-PROBE = """
-(async () => {
-  await visits.ready;
-  const { pair } = visits;
-  const by = (id) => document.getElementById(id);
-  const sum = () => pair.pixels().reduce((total, value) => total + value, 0);
-  const half = (right) => {
-    const bytes = pair.pixels();
-    const { width, height } = pair.canvas;
-    let total = 0;
-    for (let y = 0; y < height; y++) {
-      for (let x = right ? width / 2 | 0 : 0; x < (right ? width : width / 2 | 0); x++) {
-        total += bytes[4 * (y * width + x)];
-      }
-    }
-    return total;
-  };
-  const drag = (target, from, to) => {
-    target.setPointerCapture = () => {};
-    target.hasPointerCapture = () => true;
-    const fire = (type, x) => target.dispatchEvent(new PointerEvent(type,
-      { pointerId: 3, clientX: x, clientY: 40, buttons: 1, bubbles: true, cancelable: true }));
-    fire("pointerdown", from);
-    for (let k = 1; k <= 5; k++) fire("pointermove", from + (to - from) * k / 5);
-    fire("pointerup", to);
-  };
-  const press = (key) => pair.canvas.dispatchEvent(
-    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
-  const box = pair.canvas.getBoundingClientRect();
-  const told = { state: document.documentElement.dataset.scenes };
-  told.stills = getComputedStyle(document.querySelector(".stills")).display;
-  const slide = (value) => {
-    by("between").value = value;
-    by("between").dispatchEvent(new Event("input"));
-  };
-  slide(100);
-  told.first = [half(false), half(true)];
-  slide(0);
-  told.second = [half(false), half(true)];
-  slide(50);
-  told.wiped = [half(false), half(true)];
-  told.text = by("between").getAttribute("aria-valuetext");
-  by("fade").click();
-  told.faded = sum();
-  told.edge = by("edge").hidden;
-  by("wipe").click();
-  drag(by("edge"), box.left + box.width / 2, box.left + box.width * 0.8);
-  told.edgeAt = by("between").value;
-  press("[");
-  told.keyed = by("between").value;
-  by("swap").click();
-  told.swapped = by("between").value;
-  const before = sum();
-  drag(pair.canvas, box.left + 40, box.left + 140);
-  told.turned = sum() !== before;
-  told.pressed = by("places").querySelectorAll("[aria-pressed=true]").length;
-  press("r");
-  pair.motion && (pair.motion.start -= 1000);
-  told.back = sum() === before;
-  told.wide = [...document.querySelectorAll(".scroll")].map((e) => e.scrollWidth - e.clientWidth);
-  told.page = document.documentElement.scrollWidth - innerWidth;
-  told.named = [...by("live").querySelectorAll("button, input, canvas")].filter((e) => !e.hidden
-    && !(e.ariaLabel || e.textContent.trim() || e.labels?.length)).length;
-  tell(told);
-})().catch((error) => tell({ failed: String(error) }));
-"""
-
-
-@pytest.fixture(scope="module")
-def page(written: tuple[Path, Result]) -> str:
-    return (written[0] / "register.html").read_text()
-
-
-@needs_chromium
-@pytest.mark.parametrize("size", [(1280, 900), (390, 780)])
-def test_both_scenes_are_live_under_one_slider(
-    page: str, tmp_path: Path, size: tuple[int, int]
-) -> None:
-    told, log = run_in(page, PROBE, tmp_path, size, coarse=True)
-    assert "failed" not in told, told
-    assert log == []
-    assert told["state"] == "live"
-    assert told["stills"] == "none"
-    assert min(told["first"] + told["second"]) > 0
-    assert told["first"] != told["second"], "a tooth has moved"
-    assert told["wiped"] == pytest.approx([told["first"][0], told["second"][1]], rel=0.01)
-    assert told["text"] == "first visit on the left 50 %, second visit on the right 50 %"
-    assert told["faded"] > 0
-    assert told["edge"] is True
-    assert told["edgeAt"] == "80"
-    assert told["keyed"] == "75"
-    assert told["swapped"] == "0"
-    assert told["turned"] is True
-    assert told["pressed"] == 0
-    assert told["back"] is True
-    assert told["wide"] == [0], "the table is cut off"
-    assert told["page"] <= 0
-    assert told["named"] == 0
-
-
-@needs_chromium
-def test_without_webgl_the_pictures_stay(page: str, tmp_path: Path) -> None:
-    blind = page.replace(
-        "<head>",
-        "<head><script>HTMLCanvasElement.prototype.getContext = () => null;</script>",
-        1,
-    )
-    script = """visits.ready.then(() => tell({
-      state: document.documentElement.dataset.scenes, live: document.getElementById("live").hidden,
-      stills: getComputedStyle(document.querySelector(".stills")).display,
-      why: document.documentElement.dataset.problem }));"""
-    told, log = run_in(blind, script, tmp_path, (1280, 900))
-    assert log == []
-    assert told["state"] == "pictures"
-    assert told["live"] is True
-    assert told["stills"] == "grid"
-    assert "WebGL2" in told["why"]
