@@ -13,7 +13,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.geometry.order import viewing_order
 from stages.fit.arrays import Floats
 from stages.fit.config import FitSettings
-from stages.fit.inputs.initial import SH_C0, facing, headlight_harmonics
+from stages.fit.inputs.initial import SH_C0, camera_share, facing, headlight_harmonics
 from stages.fit.inputs.scene import Scene
 from stages.fit.numerics.light import prediction_errors
 from stages.fit.parts.light import Light
@@ -116,8 +116,9 @@ def harmonics_for_viewers(fit: Trainer, cameras: Sequence[Camera]) -> Floats:
     normals = part.normals().astype(np.float64)
     cosine = facing(positions, normals, cameras)
     albedo = np.clip(part.material[:, :3].astype(np.float64), 0, 1.2)
-    colours = albedo * (1 - s.headlight + s.headlight * cosine)[:, None]
-    matte = headlight_harmonics(colours, normals, cosine, s.headlight, s.sh_degree)
+    share = camera_share(albedo, s.headlight, s.headlight_shoulder)
+    colours = albedo * (1 - share + share * cosine[:, None])
+    matte = headlight_harmonics(colours, normals, cosine, share, s.sh_degree)
     degrees = np.sqrt(np.arange(terms)).astype(int)
     trust = np.array(MATTE)[degrees]
     gram = np.tile(np.diag(trust), (len(packed), 1, 1))

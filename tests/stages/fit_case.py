@@ -50,7 +50,14 @@ def case(**sizes: tuple[int, int]) -> tuple[Views, Cameras, Points]:
     )
     truth = unpack(
         initial_gaussians(
-            cloud, cameras, opacity=0.95, scale=1.0, scale_max_px=6, degree=0, headlight=0
+            cloud,
+            cameras,
+            opacity=0.95,
+            scale=1.0,
+            scale_max_px=6,
+            degree=0,
+            headlight=0,
+            shoulder=0,
         )
     )
     images = [np.clip(render(truth, camera, threads=1).image, 0, 1) for camera in cameras]

@@ -9,12 +9,19 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from stages.fit.config import FitConfig, resolve
-from stages.fit.inputs.initial import Cloud, smooth_normals, thin
+from stages.fit.inputs.initial import (
+    Cloud,
+    camera_share,
+    headlight_harmonics,
+    smooth_normals,
+    thin,
+)
 from stages.fit.inputs.scene import out_of_place, trusted_points
 from stages.fit.inputs.targets import Target, make_target
 from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
 from stages.fit.parts.camera import Background, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
+from stages.splatting.harmonics import harmonics
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -128,6 +135,34 @@ def test_normals_are_averaged_on_one_side_of_a_sheet_only() -> None:
     assert np.allclose(np.linalg.norm(smooth, axis=1), 1)
     assert smooth[:400, 2].mean() < -0.97 > normals[:400, 2].mean() - 0.1
     assert (smooth[400:, 2] > 0.99).all()
+
+
+def test_what_is_bright_loses_little_as_it_turns_away() -> None:
+    """Enamel that is nearly white would else be grey from the side; without a shoulder it is."""
+    colors = np.array([[0.4, 0.4, 0.4], [0.95, 0.95, 0.95], [0.9, 0.4, 0.4], [0.95, 0.95, 0.95]])
+    normals = np.array([[0, 0, -1.0]] * 3 + [[0, 0, 0]])
+    cosine = np.ones(4)
+    rays = {at: np.tile([np.sqrt(1 - at**2), 0, at], (4, 1)) for at in (1.0, 0.5)}
+
+    def seen(share: np.ndarray, at: float) -> np.ndarray:
+        sh = headlight_harmonics(colors, normals, cosine, share, 2)
+        return 0.5 + np.einsum("nk,nkc->nc", harmonics(rays[at])[:, :9], sh)
+
+    share = camera_share(colors, 0.8, 1.0)
+    assert np.allclose(seen(share, 1.0), colors, atol=1e-6)  # as they were seen
+    turned = seen(share, 0.5) / colors
+    assert turned[0] == pytest.approx(0.6)  # 1 - .8 + .8 * .5
+    assert turned[1] == pytest.approx(0.8)
+    assert turned[2] == pytest.approx([0.78, 0.6, 0.6])  # gum gets redder
+    assert turned[3] == pytest.approx(1.0)  # whichever way it faces
+    plain = seen(camera_share(colors, 0.8, 0.0), 0.5) / colors
+    assert plain[:3] == pytest.approx(np.full((3, 3), 0.6))
+
+
+def test_the_share_of_light_is_for_photographs_of_a_held_surface() -> None:
+    held, free = (resolve(FitConfig(), 3, 0, held=held) for held in (True, False))
+    assert (held.headlight, held.headlight_shoulder) == (0.8, 1.0)
+    assert (free.headlight, free.headlight_shoulder) == (0.6, 0.0)
 
 
 def test_thinning_keeps_confidence_a_confidence() -> None:

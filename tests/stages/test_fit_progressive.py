@@ -22,7 +22,8 @@ from tests.stages.fit_case import StoppedError, case, context, looking, outputs,
 
 PLAIN = {
     "light": "none", "hold_surface": False, "lambda_flow": 0.0, "lambda_depth": 0.0,
-    "headlight": 0.0, "sh_degree": 0, "coarse_fraction": 0.0, "trusted_confidence": 1.0,
+    "headlight": 0.0, "headlight_shoulder": 0.0, "sh_degree": 0, "coarse_fraction": 0.0,
+    "trusted_confidence": 1.0,
     "optimize_poses": False, "densify": False, "initial_opacity": 0.9,
 }  # fmt: skip
 PROGRESSIVE = {
@@ -41,7 +42,7 @@ def painted(cameras: list[Camera]) -> Views:
     arrays = (np.asarray(a, np.float64) for a in (dense.positions, dense.colors, dense.normals))
     packed = initial_gaussians(
         Cloud(*arrays, np.ones(len(dense))), cameras, opacity=0.95, scale=1.0, scale_max_px=6,
-        degree=0, headlight=0,
+        degree=0, headlight=0, shoulder=0,
     )  # fmt: skip
     images = [np.clip(render(unpack(packed), c, threads=1).image, 0, 1) for c in cameras]
     return Views(tuple(View(c.name, i) for c, i in zip(cameras, images, strict=True)))

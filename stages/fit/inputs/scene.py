@@ -64,6 +64,7 @@ class Scene:
                 cloud, self.cameras, opacity=settings.initial_opacity,
                 scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
                 degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
+                shoulder=settings.headlight_shoulder,
             )  # fmt: skip
         extent, middle = self.extent()
         poses = np.array([camera.cam_from_world[:3] for camera in self.cameras])

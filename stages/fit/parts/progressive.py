@@ -149,6 +149,7 @@ class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed"
         return initial_gaussians(
             there, [camera], opacity=s.initial_opacity, scale=s.initial_scale,
             scale_max_px=s.initial_scale_max_px, degree=s.sh_degree, headlight=s.headlight,
+            shoulder=s.headlight_shoulder,
         )  # fmt: skip
 
 

@@ -1,0 +1,201 @@
+"""One of three photographs predicted from the other two: how well colours turn with the view.
+
+    PYTHONPATH=. python benchmarks/unseen_photograph.py WORKSPACE ... [--left-out 0|1|2]
+                                                        [--set FIELD=VALUE ...] [--pictures DIR]
+
+Each workspace is of three photographs, run up to `sap`. Cameras and surface are those of all three;
+colours are fitted to two of them, at about half size. Compared is what the third shows of surface
+that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
+other truth: this is the one figure of unseen views that they give. --set says a setting of the fit
+anew: `--set headlight=0.6 --set headlight_shoulder=0`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from pipeline.store import Store
+from stages.fit.config import FitConfig, resolve
+from stages.fit.inputs.initial import Cloud
+from stages.fit.inputs.scene import Scene, prepare
+from stages.fit.numerics.light import sighted
+from stages.splatting.rasterizer import use_threads
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+
+#: What is the same in all runs: no light, as in each real case so far, and nothing of geometry.
+FIXED = {"light": "none", "lambda_flow": 0.0, "detail": False, "optimize_poses": False}
+#: Gaussians; the width of photographs is halved until it is at most this.
+POINTS, WIDTH = 40_000, 700
+#: How far a point may lie behind what a photograph shows, and least cosine of a good look at it.
+TOLERANCE, LEAST_COSINE = 0.01, 0.3
+#: Compared is where the render is at least this solid; gains are found below this brightness.
+SOLID, BRIGHT = 0.9, 0.97
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Attributes:
+    shown: [3, H, W] the photograph that was left out; predicted: the same, with the gains.
+    compared: [H, W] where.
+    gains: [3] of the channels.
+    """
+
+    shown: Floats
+    predicted: Floats
+    compared: Bools
+    gains: Array
+
+    @property
+    def psnr(self) -> float:
+        """Of the pixels that are compared, dB."""
+        error = (self.predicted - self.shown)[:, self.compared]
+        return float(-10 * np.log10((error.astype(np.float64) ** 2).mean()))
+
+
+def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
+    """The scene of a workspace, the fit's settings, and the factor by which images are reduced."""
+    store = Store(workspace)
+
+    def loaded(stage: str, kind: str) -> Any:
+        result = store.in_use(stage)
+        if result is None:
+            raise SystemExit(f"{workspace} has no result of {stage}: run it up to sap first.")
+        return store.load(result, kind)
+
+    cameras = loaded("align", "cameras").by_name()
+    views = [view for view in loaded("init", "views").views if view.name in cameras]
+    if len(views) != 3:
+        raise SystemExit(f"{workspace}: {len(views)} photographs are placed, three are needed.")
+    factor = 1
+    while max(view.image.shape[1] for view in views) / factor > WIDTH:
+        factor *= 2
+    resolved = resolve(
+        settings.model_copy(update={"coarse_factor": max(factor, 2), "coarse_fraction": 0.5}),
+        len(views) - 1, 0, True,
+    )  # fmt: skip
+    cameras_in_order = [cameras[view.name] for view in views]
+    scene = prepare(views, cameras_in_order, loaded("sap", "points"), None, resolved)
+    return scene, resolved.but(coarse_fraction=0.0), factor
+
+
+def cosines(scene: Scene, view: int) -> Array:
+    """[N] of each point's normal with the line of sight of a view that sees it; 0: none does."""
+    cloud, camera = scene.cloud, scene.cameras[view]
+    _, _, seen = sighted(
+        cloud.positions, cloud.positions, scene.views[view].valid(), camera, TOLERANCE
+    )
+    ray = camera.centre - cloud.positions
+    cosine = (cloud.normals * ray).sum(1) / np.linalg.norm(ray, axis=1)
+    return np.asarray(np.where(seen, np.maximum(cosine, 0.05), 0))
+
+
+def coloured(scene: Scene, views: list[int]) -> Cloud:
+    """The points with the colours that some views show; those that none sees keep theirs."""
+    cloud = scene.cloud
+    total, mass = np.zeros_like(cloud.colors), np.zeros(len(cloud))
+    for view in views:
+        row, column, _ = sighted(
+            cloud.positions, cloud.positions, scene.views[view].valid(), scene.cameras[view],
+            TOLERANCE,
+        )  # fmt: skip
+        weight = cosines(scene, view) ** 2
+        total += weight[:, None] * scene.views[view].image[row, column]
+        mass += weight
+    known = mass > 0
+    colors = np.where(known[:, None], total / np.maximum(mass, 1e-9)[:, None], cloud.colors)
+    return replace(cloud, colors=colors)
+
+
+def seen_elsewhere(scene: Scene, view: int) -> Bools:
+    """[H, W] where a view shows surface that another one sees well."""
+    cloud, photo = scene.cloud, scene.views[view]
+    best = np.max([cosines(scene, k) for k in range(len(scene.views)) if k != view], axis=0)
+    row, column, seen = sighted(
+        cloud.positions, cloud.positions, photo.valid(), scene.cameras[view], TOLERANCE
+    )
+    good, bad = np.zeros((2, *photo.image.shape[:2]), np.uint8)
+    for mask, points in ((good, seen & (best > LEAST_COSINE)), (bad, seen & (best < LEAST_COSINE))):
+        mask[row[points], column[points]] = 1
+    good = cv2.morphologyEx(good, cv2.MORPH_CLOSE, np.ones((5, 5)))
+    return (good > 0) & (cv2.dilate(bad, np.ones((3, 3))) == 0) & photo.valid()
+
+
+def predict(workspace: Path, view: int, settings: FitConfig) -> Prediction:
+    """Fit two photographs and look from where the third was taken."""
+    scene, resolved, factor = read_scene(workspace, settings)
+    others = [k for k in range(len(scene.views)) if k != view]
+    mask = seen_elsewhere(scene, view)
+    rest = replace(scene, cloud=coloured(scene, others)).reduced(factor).without([view])
+    trainer = rest.trainer(resolved, False)
+    trainer.run(None, lambda *_: None)
+    for part in trainer.parts:
+        part.end(trainer)
+    target = scene.targets[view][factor]
+    drawn = trainer.look(trainer.viewpoint(scene.cameras[view].cam_from_world[:3], target))
+    image = np.clip(trainer.composited(None, drawn), 0, 1)
+    shown = target.colour.target
+    small = cv2.resize(mask.astype(np.uint8), shown.shape[:0:-1], interpolation=cv2.INTER_NEAREST)
+    compared = (small > 0) & (1 - drawn.transmittance > SOLID)
+    ratios = [
+        (shown[c] / np.maximum(image[c], 0.02))[compared & (shown[c] < BRIGHT)] for c in range(3)
+    ]
+    gains = np.array([np.median(ratio) for ratio in ratios])
+    predicted = np.clip(image * gains[:, None, None], 0, 1).astype(np.float32)
+    return Prediction(shown, predicted, compared, gains)
+
+
+def picture(found: Prediction) -> npt.NDArray[np.uint8]:
+    """Photograph and prediction beside each other, dark where they are not compared."""
+    sides = [np.where(found.compared, image, image / 3) for image in (found.shown, found.predicted)]
+    rgb = np.concatenate(sides, 2).transpose(1, 2, 0)
+    return np.round(255 * rgb[..., ::-1]).astype(np.uint8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("workspaces", nargs="*", type=Path)
+    parser.add_argument("--left-out", type=int, default=1, help="by order of the views; default 1")
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    if not args.workspaces:
+        print("benchmarks/unseen_photograph.py: nothing to do without a WORKSPACE")
+        return
+    use_threads(args.threads)
+    said = {
+        name: yaml.safe_load(value) for name, value in (item.split("=", 1) for item in args.set)
+    }
+    settings = FitConfig.model_validate({**FIXED, "initial_points": POINTS, **said})
+    scores = []
+    for workspace in args.workspaces:
+        found = predict(workspace, args.left_out, settings)
+        scores.append(found.psnr)
+        gains = ", ".join(f"{gain:.2f}" for gain in found.gains)
+        share = found.compared.mean()
+        print(
+            f"{workspace.name}: {found.psnr:.2f} dB on {share:.0%} of it, gains {gains}", flush=True
+        )
+        if args.pictures:
+            args.pictures.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(args.pictures / f"{workspace.name}.jpg"), picture(found))
+    low, high = min(scores), max(scores)
+    print(f"mean {np.mean(scores):.2f} dB ({low:.2f} to {high:.2f}), {len(scores)} cases")
+
+
+if __name__ == "__main__":
+    main()
