@@ -1,7 +1,7 @@
 """One of three photographs predicted from the other two: how well colours turn with the view.
 
-    PYTHONPATH=. python benchmarks/unseen_photograph.py WORKSPACE ... [--left-out 0|1|2]
-                                                        [--set FIELD=VALUE ...] [--pictures DIR]
+    python benchmarks/unseen_photograph.py WORKSPACE ... [--left-out 0|1|2] [--set FIELD=VALUE ...]
+                                           [--pictures DIR] [--threads 2]
 
 Each workspace is of three photographs, run up to `sap`. Cameras and surface are those of all three;
 colours are fitted to two of them, at about half size. Compared is what the third shows of surface
@@ -13,7 +13,6 @@ anew: `--set headlight=0.6 --set headlight_shoulder=0`.
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import yaml
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from pipeline.store import Store
 from stages.fit.config import FitConfig, resolve
@@ -40,8 +37,9 @@ Bools = npt.NDArray[np.bool_]
 FIXED = {"light": "none", "lambda_flow": 0.0, "detail": False, "optimize_poses": False}
 #: Gaussians; the width of photographs is halved until it is at most this.
 POINTS, WIDTH = 40_000, 700
-#: How far a point may lie behind what a photograph shows, and least cosine of a good look at it.
-TOLERANCE, LEAST_COSINE = 0.01, 0.3
+#: How far a point may lie from what a photograph shows (a share of the depth), least cosine of a
+#: good look at it, and what counts for one at more of a slant: some colour is better than none.
+TOLERANCE, LEAST_COSINE, SLANTED = 0.01, 0.3, 0.05
 #: Compared is where the render is at least this solid; gains are found below this brightness.
 SOLID, BRIGHT = 0.9, 0.97
 
@@ -92,44 +90,53 @@ def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
     return scene, resolved.but(coarse_fraction=0.0), factor
 
 
-def cosines(scene: Scene, view: int) -> Array:
-    """[N] of each point's normal with the line of sight of a view that sees it; 0: none does."""
-    cloud, camera = scene.cloud, scene.cameras[view]
-    _, _, seen = sighted(
-        cloud.positions, cloud.positions, scene.views[view].valid(), camera, TOLERANCE
-    )
-    ray = camera.centre - cloud.positions
-    cosine = (cloud.normals * ray).sum(1) / np.linalg.norm(ray, axis=1)
-    return np.asarray(np.where(seen, np.maximum(cosine, 0.05), 0))
+@dataclass(frozen=True)
+class Sight:
+    """Attributes:
+    row, column: [N] where a view would show each point.
+    cosine: [N] of its normal with the line of sight; 0 where the view does not show it.
+    """
+
+    row: npt.NDArray[np.int64]
+    column: npt.NDArray[np.int64]
+    cosine: Array
 
 
-def coloured(scene: Scene, views: list[int]) -> Cloud:
+def sights(scene: Scene) -> list[Sight]:
+    """How each view sees the points."""
+    cloud, found = scene.cloud, []
+    for view, camera in zip(scene.views, scene.cameras, strict=True):
+        row, column, seen = sighted(
+            cloud.positions, cloud.positions, view.valid(), camera, TOLERANCE
+        )
+        ray = camera.centre - cloud.positions
+        cosine = (cloud.normals * ray).sum(1) / np.linalg.norm(ray, axis=1)
+        found.append(Sight(row, column, np.where(seen, np.maximum(cosine, SLANTED), 0)))
+    return found
+
+
+def coloured(scene: Scene, seen: list[Sight], views: list[int]) -> Cloud:
     """The points with the colours that some views show; those that none sees keep theirs."""
     cloud = scene.cloud
     total, mass = np.zeros_like(cloud.colors), np.zeros(len(cloud))
     for view in views:
-        row, column, _ = sighted(
-            cloud.positions, cloud.positions, scene.views[view].valid(), scene.cameras[view],
-            TOLERANCE,
-        )  # fmt: skip
-        weight = cosines(scene, view) ** 2
-        total += weight[:, None] * scene.views[view].image[row, column]
+        sight = seen[view]
+        weight = sight.cosine**2
+        total += weight[:, None] * scene.views[view].image[sight.row, sight.column]
         mass += weight
     known = mass > 0
     colors = np.where(known[:, None], total / np.maximum(mass, 1e-9)[:, None], cloud.colors)
     return replace(cloud, colors=colors)
 
 
-def seen_elsewhere(scene: Scene, view: int) -> Bools:
+def seen_elsewhere(scene: Scene, seen: list[Sight], view: int) -> Bools:
     """[H, W] where a view shows surface that another one sees well."""
-    cloud, photo = scene.cloud, scene.views[view]
-    best = np.max([cosines(scene, k) for k in range(len(scene.views)) if k != view], axis=0)
-    row, column, seen = sighted(
-        cloud.positions, cloud.positions, photo.valid(), scene.cameras[view], TOLERANCE
-    )
+    photo, own = scene.views[view], seen[view]
+    best = np.max([sight.cosine for sight in seen if sight is not own], axis=0)
     good, bad = np.zeros((2, *photo.image.shape[:2]), np.uint8)
-    for mask, points in ((good, seen & (best > LEAST_COSINE)), (bad, seen & (best < LEAST_COSINE))):
-        mask[row[points], column[points]] = 1
+    for mask, points in ((good, best > LEAST_COSINE), (bad, best <= LEAST_COSINE)):
+        shown = points & (own.cosine > 0)
+        mask[own.row[shown], own.column[shown]] = 1
     good = cv2.morphologyEx(good, cv2.MORPH_CLOSE, np.ones((5, 5)))
     return (good > 0) & (cv2.dilate(bad, np.ones((3, 3))) == 0) & photo.valid()
 
@@ -138,8 +145,9 @@ def predict(workspace: Path, view: int, settings: FitConfig) -> Prediction:
     """Fit two photographs and look from where the third was taken."""
     scene, resolved, factor = read_scene(workspace, settings)
     others = [k for k in range(len(scene.views)) if k != view]
-    mask = seen_elsewhere(scene, view)
-    rest = replace(scene, cloud=coloured(scene, others)).reduced(factor).without([view])
+    seen = sights(scene)
+    mask = seen_elsewhere(scene, seen, view)
+    rest = replace(scene, cloud=coloured(scene, seen, others)).reduced(factor).without([view])
     trainer = rest.trainer(resolved, False)
     trainer.run(None, lambda *_: None)
     for part in trainer.parts:
@@ -168,7 +176,13 @@ def picture(found: Prediction) -> npt.NDArray[np.uint8]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("workspaces", nargs="*", type=Path)
-    parser.add_argument("--left-out", type=int, default=1, help="by order of the views; default 1")
+    parser.add_argument(
+        "--left-out",
+        type=int,
+        choices=(0, 1, 2),
+        default=1,
+        help="by order of the views; default 1",
+    )
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--threads", type=int, default=2)

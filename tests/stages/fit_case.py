@@ -50,16 +50,10 @@ def case(**sizes: tuple[int, int]) -> tuple[Views, Cameras, Points]:
     )
     truth = unpack(
         initial_gaussians(
-            cloud,
-            cameras,
-            opacity=0.95,
-            scale=1.0,
-            scale_max_px=6,
-            degree=0,
-            headlight=0,
+            cloud, cameras, opacity=0.95, scale=1.0, scale_max_px=6, degree=0, headlight=0,
             shoulder=0,
         )
-    )
+    )  # fmt: skip
     images = [np.clip(render(truth, camera, threads=1).image, 0, 1) for camera in cameras]
     views = tuple(View(c.name, image) for c, image in zip(cameras, images, strict=True))
     return Views(views), Cameras(tuple(cameras)), surface()

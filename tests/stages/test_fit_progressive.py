@@ -22,8 +22,7 @@ from tests.stages.fit_case import StoppedError, case, context, looking, outputs,
 
 PLAIN = {
     "light": "none", "hold_surface": False, "lambda_flow": 0.0, "lambda_depth": 0.0,
-    "headlight": 0.0, "headlight_shoulder": 0.0, "sh_degree": 0, "coarse_fraction": 0.0,
-    "trusted_confidence": 1.0,
+    "headlight": 0.0, "sh_degree": 0, "coarse_fraction": 0.0, "trusted_confidence": 1.0,
     "optimize_poses": False, "densify": False, "initial_opacity": 0.9,
 }  # fmt: skip
 PROGRESSIVE = {

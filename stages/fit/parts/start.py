@@ -37,9 +37,9 @@ class Shading(Part, absent={"normal_neighbours": 0, "headlight": 0.0, "headlight
         """average normals over so many points; 0: as they are"""
         headlight: AutoFloat = automatic({3: 0.6}, held=0.8, lt=1)
         """share of the light that comes from the camera, to start degree 1 from normals"""
-        # frontal photographs of twelve patients, each predicted from those of both sides: 19.5 dB;
-        # with .6 for dark and bright alike, the best such share, 19.2
-        # (benchmarks/unseen_photograph.py). A castle in the sun loses by it
+        # twelve patients' frontal photographs, each predicted from those of both sides: 19.5 dB,
+        # with one share for dark and bright 19.2 (.4), 19.4 (.5), 19.2 (.6); their right ones: 19.1
+        # and 18.2, 18.6, 18.7 (benchmarks/unseen_photograph.py). A castle in the sun loses by it
         headlight_shoulder: AutoFloat = automatic({3: 0.0}, held=1.0, le=1)
         """by how much less of itself that share is for each unit of brightness above .45, as tone
         curves press together what is bright"""
