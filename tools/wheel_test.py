@@ -18,6 +18,8 @@ import venv
 import zipfile
 from pathlib import Path
 
+from pipeline.kernels.folder import SUFFIX
+
 ROOT = Path(__file__).resolve().parents[1]
 #: All that a wheel is made of. Whatever else it needed would be missing here.
 SOURCES = (
@@ -104,17 +106,15 @@ def install(wheel: Path, env: Path) -> Path:
 
 
 def borrow_kernels(installed: Path) -> None:
-    """Take along what numba has compiled of the same sources: that saves a minute or two.
+    """Take along the kernels compiled of the same sources: that saves a minute or two.
 
-    Its cache lies beside a source and is good for the time that the source was changed.
+    Their names say of which sources (`pipeline.kernels`): others are not asked for.
     """
-    for path in (installed / "stages").rglob("*.py"):
-        twin = ROOT / path.relative_to(installed)
-        kernels = [*(twin.parent / "__pycache__").glob(f"{twin.stem}.*.nb[ic]")]
-        if kernels and twin.read_bytes() == path.read_bytes():
-            shutil.copystat(twin, path)
-            for kernel in kernels:
-                shutil.copy(kernel, path.parent / "__pycache__")
+    kernels = ROOT / "pipeline" / "kernels" / "__pycache__"
+    borrowed = installed / "pipeline" / "kernels" / "__pycache__"
+    borrowed.mkdir(exist_ok=True)
+    for kernel in kernels.glob(f"*{SUFFIX}"):
+        shutil.copy(kernel, borrowed)
 
 
 def traps(place: Path) -> Path:
