@@ -57,7 +57,7 @@ def console(log: str) -> list[str]:
 
 def run_in(
     text: str, script: str, folder: Path, size: tuple[int, int], address: str = "",
-    coarse: bool = False,
+    coarse: bool = False, framed: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
     """Run a script in a page; returns what it told, and the messages on the console.
 
@@ -69,11 +69,13 @@ def run_in(
         address: see `browse`.
         coarse: two pixels of a page are one of the screen: scenes are drawn in a quarter of the
             time.
+        framed: in a frame in any case, to which the script may give another size: `await
+            resized(width, height)`.
     """
     page = folder / f"page{len(list(folder.iterdir()))}.html"
     page.write_text(text.replace("</body>", _TELL + f"<script>{script}</script></body>"))
     file = page
-    if size[0] < NARROWEST:
+    if framed or size[0] < NARROWEST:
         file = page.with_name(f"frame_of_{page.name}")
         file.write_text(_FRAME.format(page.name, html.escape(address), *size))
         address = ""
@@ -104,11 +106,21 @@ function tell(result) {
   shown.textContent = text;
   document.body.append(shown);
 }
+function resized(width, height) {
+  parent.postMessage({ width: `${width}px`, height: `${height}px` }, "*");
+  return new Promise((done) => addEventListener("message", done, { once: true }));
+}
 </script>"""
 _FRAME = """<!doctype html><title>frame</title><body style="margin:0">
 <iframe src="{0}{1}" style="border:0;width:{2}px;height:{3}px"></iframe>
 <script>
 addEventListener("message", (event) => {{
+  const frame = document.querySelector("iframe");
+  if (event.data.width) {{
+    Object.assign(frame.style, event.data);
+    frame.getBoundingClientRect();  // now, without waiting for a picture that may not be drawn
+    return event.source.postMessage("resized", "*");
+  }}
   const shown = document.createElement("pre");
   shown.id = "told";
   shown.textContent = event.data;

@@ -114,7 +114,7 @@ def test_the_command_line_in_any_locale(odd: Path, locale: dict[str, str]) -> No
         assert b"\x1b" not in text
         return text.decode()  # whatever the locale, it is text
 
-    call("run", odd, "-w", odd / "w", "--stages", "views")
+    call("run", odd, "-w", odd / "w", "--stages", "views", "--set", "report=false")
     assert "cached" in call("status", "-w", odd / "w")
     assert "report.html" in call("report", "-w", odd / "w")
     page = (odd / "w" / "report.html").read_bytes().decode("utf-8")

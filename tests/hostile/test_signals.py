@@ -82,12 +82,18 @@ def interrupted(status: int, told: str) -> None:
     assert "Traceback" not in told and "Exception ignored" not in told and "@  " not in told
 
 
-@pytest.mark.parametrize("number", signals.ENDING)
-def test_a_run_is_interrupted_and_goes_on(toys: Path, number: int) -> None:
-    with started([sys.executable, str(TOY), *RUN], toys) as process:
-        assert eventually(lambda: any(toys.glob("w/count/*.partial/scratch/checkpoint.json")))
-        process.send_signal(number)
-        interrupted(*ended(process))
+def test_a_run_is_interrupted_and_goes_on(toys: Path) -> None:
+    """By each signal in turn."""
+    for count, number in enumerate(signals.ENDING):
+        with started([sys.executable, str(TOY), *RUN], toys) as process:
+            if count == 0:
+                checkpoint = "w/count/*.partial/scratch/checkpoint.json"
+                assert eventually(lambda pattern=checkpoint: any(toys.glob(pattern)))
+            else:
+                assert process.stderr is not None
+                assert any("goes on from its checkpoint" in line for line in process.stderr)
+            process.send_signal(number)
+            interrupted(*ended(process))
     again = subprocess.run(
         [sys.executable, str(TOY), *RUN], cwd=toys, capture_output=True, text=True, timeout=60
     )

@@ -6,10 +6,8 @@ import json
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -124,34 +122,13 @@ def test_really_full_disk(toys: Path) -> None:
         subprocess.run(["umount", str(small)], check=True)
 
 
-def test_interrupt_is_resumable(toys: Path) -> None:
-    slow = (*RUN, "--set", "count.step_seconds=0.05")
-    # Started in the background, a test run ignores interrupts, and so would its children.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    process = subprocess.Popen(command(*slow), cwd=toys, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
-    wait_for_checkpoint(toys / "w")
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30) == 130
-    assert "Run the same command again" in process.stderr.read()  # type: ignore[union-attr]
-    assert "goes on from its checkpoint" in call(toys, *slow).stderr
-
-
-def wait_for_checkpoint(workspace: Path) -> None:
-    for _ in range(600):
-        if any(workspace.glob("count/*.partial/scratch/checkpoint.json")):
-            return
-        time.sleep(0.02)
-    raise AssertionError("the run never came to its checkpoint")
-
-
 def test_kill_at_any_moment_changes_no_byte(toys: Path) -> None:
     whole = call(toys, *RUN[:3], "whole", *RUN[4:])
     assert whole.returncode == 0
     slow = (*RUN, "--set", "count.step_seconds=0.03")
     moments = random.Random(0)
     killed = 0
-    while killed < 8:
+    while killed < 5:
         process = subprocess.Popen(
             command(*slow), cwd=toys, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

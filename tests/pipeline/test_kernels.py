@@ -83,36 +83,28 @@ class TestSource:
     def test_a_kernel_is_compiled_once(self, sums):
         assert run(sums) == (120.0, 1)
         assert run(sums) == (120.0, 0)
+        (file,) = (sums.parent / "cache" / "dentalsplat").iterdir()
+        file.write_bytes(file.read_bytes()[:-100])  # half a file is none
+        assert run(sums) == (120.0, 1)
+        assert run(sums) == (120.0, 0)
         assert len(kept(sums)) == 1
 
-    def test_an_edited_helper_counts(self, sums):
-        run(sums)
-        parts = sums / "parts.py"
-        parts.write_text(HELPERS.replace("2 * value", "3 * value"))
-        assert run(sums) == (180.0, 1)
-        parts.write_text(HELPERS.replace("FACTOR = 10", "FACTOR = 1"))
-        assert run(sums) == (12.0, 1)
-        parts.write_text(HELPERS)
-        assert run(sums) == (120.0, 0)
-
-    def test_old_states_are_deleted(self, sums):
-        for factor in range(folder.KEPT + 2):
-            (sums / "parts.py").write_text(HELPERS.replace("10", str(factor)))
-            assert run(sums) == (12.0 * factor, 1)
+    def test_an_edited_helper_counts_and_old_states_are_deleted(self, sums):
+        edits = [("10", "10"), ("2 * value", "3 * value")]
+        edits += [("10", str(factor)) for factor in range(folder.KEPT)]
+        values = [120.0, 180.0, *(12.0 * factor for factor in range(folder.KEPT))]
+        for edit, value in zip(edits, values, strict=True):
+            (sums / "parts.py").write_text(HELPERS.replace(*edit))
+            assert run(sums) == (value, 1)
         assert len(kept(sums)) == folder.KEPT
+        (sums / "parts.py").write_text(HELPERS.replace(*edits[-2]))
+        assert run(sums) == (values[-2], 0)
 
     def test_two_processes_at_once(self, sums):
         both = [started(sums) for _ in range(2)]
         values = [process.communicate(timeout=120)[0].split()[0] for process in both]
         assert values == ["120.0", "120.0"]
         assert len(kept(sums)) == 1
-
-    def test_half_a_file_is_none(self, sums):
-        run(sums)
-        (file,) = (sums.parent / "cache" / "dentalsplat").iterdir()
-        file.write_bytes(file.read_bytes()[:-100])
-        assert run(sums) == (120.0, 1)
-        assert run(sums) == (120.0, 0)
 
 
 def twice(values):

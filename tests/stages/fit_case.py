@@ -63,7 +63,7 @@ def context(tmp_path, views, cameras, points, flow=None, threads=2, **config):
     inputs = {"views": views, "cameras": cameras, "points": points}
     if flow is not None:
         inputs["flow"] = flow
-    config = {"iterations": 60, "initial_points": 1500, **config}
+    config = {"iterations": 60, "initial_points": 1500, "light_trial_iterations": 30, **config}
     return LocalContext(FitConfig(**config), tmp_path, inputs, threads=threads, seed=3)
 
 

@@ -5,13 +5,15 @@ test: teeth of their own sizes, out of line, on arches of their own shapes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from data_samples.mouths import Mouth, Photograph, photograph, random_mouth
 from data_samples.mouths.cameras import Camera, look
@@ -78,6 +80,20 @@ class Case:
         return [photo.cam_from_world[:3, :3] for photo in self.photos]
 
 
+@contextmanager
+def in_the_dark() -> Iterator[None]:
+    """Photographs show nothing, and take a tenth of the time; their labels are the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "data_samples.mouths.photo.look_along",
+            lambda stage, hit, light, eye: np.full((len(hit["t_hit"]), 3), -1.0),
+        )
+        patch.setattr(
+            "data_samples.mouths.mouth.sky_share", lambda _, vertices, *more: np.ones(len(vertices))
+        )
+        yield
+
+
 def mouth_case(
     seed: int,
     yaws: Sequence[float] = (-42.0, 3.0, 40.0),
@@ -86,6 +102,7 @@ def mouth_case(
     side: float = 1.9,
     plain: bool = True,
     calm: bool = True,
+    dark: bool = False,
     **options: Any,
 ) -> Case:
     """Photographs of a mouth at some yaws (degrees, from the patient's left positive).
@@ -94,6 +111,7 @@ def mouth_case(
         side: focal length over the long side of the picture.
         plain: without lips, hands, noise.
         calm: without what is not asked for (`CALM`); else all at random.
+        dark: for who looks at labels and cameras only (`in_the_dark`).
         options: of the mouth (`MouthOptions`).
     """
     rng = np.random.default_rng(seed)
@@ -106,12 +124,13 @@ def mouth_case(
         focal = side * WIDTH
         view = look(yaw, 4.0, roll, distance, pivot)
         camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, view)
-        photos.append(
-            photograph(
-                mouth, rng, role, width=WIDTH, height=HEIGHT, bite="closed", camera=camera,
-                plain=plain,
-            )
-        )  # fmt: skip
+        with in_the_dark() if dark else nullcontext():
+            photos.append(
+                photograph(
+                    mouth, rng, role, width=WIDTH, height=HEIGHT, bite="closed", camera=camera,
+                    plain=plain,
+                )
+            )  # fmt: skip
     return Case(tuple(photos))
 
 

@@ -28,6 +28,8 @@ from tests.stages.dental_patient import WIDTH, fit, rotation_errors, three
 
 #: Fewer rivals are tried than for a patient; with all 40 the numbers of these mouths are the same.
 QUICK = ArchOptions(rows_tried=8)
+#: Hardly any rivals, where it does not matter which labelling wins.
+SHORT = ArchOptions(rows_tried=3, candidates_per_view=2, beam=2)
 
 
 def test_textbook_arch_is_symmetric_and_named_once() -> None:
@@ -134,9 +136,9 @@ def test_three_photographs(yaws: tuple[float, ...]) -> None:
 
 def test_any_order_and_any_number_of_threads_give_the_same() -> None:
     dentitions, _, _ = three()
-    forward = fit(dentitions, QUICK)
-    threaded = fit(dentitions, QUICK, threads=2)
-    shuffled = fit([dentitions[k] for k in (2, 0, 1)], QUICK)
+    forward = fit(dentitions, SHORT)
+    threaded = fit(dentitions, SHORT, threads=2)
+    shuffled = fit([dentitions[k] for k in (2, 0, 1)], SHORT)
     assert [view.role for view in shuffled.views] == ["left", "right", "frontal"]
     for k, place in ((2, 0), (0, 1), (1, 2)):
         assert forward.views[k].upper == shuffled.views[place].upper
@@ -154,7 +156,7 @@ def test_roll_is_taken_out_and_put_back() -> None:
 
 def test_known_focal_lengths_are_held() -> None:
     dentitions, _, _ = three()
-    result = fit(dentitions, QUICK, focals=[950.0, None, 950.0])
+    result = fit(dentitions, SHORT, focals=[950.0, None, 950.0])
     assert result.views[0].focal == 950.0
     assert result.views[2].focal == 950.0
     assert result.views[1].focal != 1.9 * WIDTH
@@ -162,9 +164,9 @@ def test_known_focal_lengths_are_held() -> None:
 
 def test_swapped_order_is_said() -> None:
     dentitions, _, teeth = three()
-    right = fit(dentitions, replace(QUICK, order=("right", "frontal", "left")))
+    right = fit(dentitions, replace(SHORT, order=("right", "frontal", "left")))
     assert right.doubts == ()
-    swapped = fit(dentitions, replace(QUICK, order=("left", "frontal", "right")))
+    swapped = fit(dentitions, replace(SHORT, order=("left", "frontal", "right")))
     assert any("swapped" in doubt for doubt in swapped.doubts)
     assert swapped.views[0].upper == teeth[0][0]
 
@@ -229,7 +231,7 @@ def test_a_number_that_a_person_has_said_is_kept() -> None:
     dentitions, _, teeth = three()
     wrong = teeth[1][0][3]
     dentitions[1] = with_crown(dentitions[1], 2, number=wrong, doubt=0.0)
-    result = fit(dentitions, QUICK)
+    result = fit(dentitions, SHORT)
     assert result.views[1].upper[2] == wrong
     assert result.views[1].upper_doubts[2] < 0.001
 
@@ -245,20 +247,20 @@ def test_numbers_that_contradict_are_refused() -> None:
     for index, tooth in ((2, teeth[1][0][4]), (3, teeth[1][0][2])):
         dentitions[1] = with_crown(dentitions[1], index, number=tooth, doubt=0.0)
     with pytest.raises(RequestError, match="contradict"):
-        fit(dentitions, QUICK)
+        fit(dentitions, SHORT)
 
 
 def test_unplaceable_photographs_are_named() -> None:
     dentitions, _, _ = three()
     few = replace(dentitions[1], upper=dentitions[1].upper[:2], lower=())
-    result = fit([dentitions[0], few, dentitions[2]], QUICK)
+    result = fit([dentitions[0], few, dentitions[2]], SHORT)
     assert result.views[1] is None
     assert any("photo 1" in doubt for doubt in result.doubts)
-    without = fit([dentitions[0], None, dentitions[2]], QUICK)
+    without = fit([dentitions[0], None, dentitions[2]], SHORT)
     assert without.views[1] is None
     assert not any("photo 1" in doubt for doubt in without.doubts)  # it was set aside before
-    nothing = fit([None, None], QUICK)
+    nothing = fit([None, None], SHORT)
     assert nothing.views == (None, None)
     assert nothing.doubts
     with pytest.raises(RequestError, match="order"):
-        fit(dentitions, replace(QUICK, order=("right", "left")))
+        fit(dentitions, replace(SHORT, order=("right", "left")))

@@ -145,7 +145,7 @@ def test_distortion_is_taken_out_of_the_image(tmp_path):
 
 def test_distorted_model_gives_undistorted_views(tmp_path):
     folder = colmap_model(tmp_path / "model", "SIMPLE_RADIAL", (-0.05,))
-    context = run(tmp_path / "out", folder)
+    context = run(tmp_path / "out", folder, dense={"planes": 16, "max_planes": 16, "fill": False})
     views = context.result("views")
     assert len(views) == 3 and context.figures["undistorted"] == 3
     assert any(
@@ -293,7 +293,7 @@ def test_known_length_gives_millimetres(tmp_path):
     mm = float(np.linalg.norm(places[0] - places[1]))
     folder = colmap_model(tmp_path / "model")
     length = {"mm": mm, "photo": "frontal", "start": tuple(start), "end": tuple(end)}
-    context = run(tmp_path / "out", folder, length=length)
+    context = run(tmp_path / "out", folder, length=length, dense={"planes": 32, "max_planes": 48})
     cameras = context.result("cameras")
     assert cameras.units == "mm"
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))

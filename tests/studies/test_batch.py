@@ -256,21 +256,20 @@ def test_quiet_it_says_nothing_and_verbose_each_step(tmp_path: Path) -> None:
     assert told[0] == told[1] and "2 of 2 cases are done" in usual[1] and quiet[1] == ""
 
 
-@pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
-def test_interrupted_or_killed_it_leaves_no_orphan_and_goes_on(
-    tmp_path: Path, how: int, status: int
-) -> None:
+def test_interrupted_or_killed_it_leaves_no_orphan_and_goes_on(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         add_case(tmp_path, name, *(ord(name) + k for k in range(2)))
-    slow = command(tmp_path, "--set", "fit.wait=60", "--jobs", "2")
-    wait_for(lambda: len(fitting(tmp_path)) == 2)
-    children = fitting(tmp_path)
-    assert all(map(alive, children))
-    slow.send_signal(how)
-    _, told = slow.communicate(timeout=30)
-    assert slow.returncode == status, told
-    wait_for(lambda: not any(map(alive, children)))
-    (tmp_path / "log.txt").write_text("")
+    for how, status in ((signal.SIGINT, 130), (signal.SIGKILL, -9)):
+        slow = command(tmp_path, "--set", "fit.wait=60", "--jobs", "2")
+        wait_for(lambda: len(fitting(tmp_path)) == 2)
+        children = fitting(tmp_path)
+        assert all(map(alive, children))
+        slow.send_signal(how)
+        _, told = slow.communicate(timeout=30)
+        assert slow.returncode == status, told
+        assert computed(tmp_path)["views"] == (2 if how == signal.SIGINT else 0)
+        wait_for(lambda those=children: not any(map(alive, those)))
+        (tmp_path / "log.txt").write_text("")
     again = command(tmp_path, "--json")
     out, told = again.communicate(timeout=60)
     assert again.returncode == 0, told

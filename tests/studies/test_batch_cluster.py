@@ -103,7 +103,7 @@ def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     cluster.work()
-    batch = cluster.batch("--set", "fit.wait=3")
+    batch = cluster.batch("--set", "fit.wait=2")
     wait_for(lambda: len(lines(tmp_path, "fit")) == 1)
     cluster.workers[0].kill()
     cluster.workers[0].wait()

@@ -15,7 +15,6 @@ from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
 from pipeline.studies.register.estimate import Estimate, Started, compared_pairs, started
 from pipeline.studies.register.frame import first_frame
-from pipeline.studies.register.geometry import inverted
 from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
@@ -34,7 +33,15 @@ def ways() -> list[Estimate]:
 
 
 @pytest.fixture(scope="module")
-def found(motions: dict[int, np.ndarray], ways: list[Estimate]) -> comparing.Comparison:
+def begun() -> list[Started]:
+    """What `ways` were before they agreed."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def found(
+    motions: dict[int, np.ndarray], ways: list[Estimate], begun: list[Started]
+) -> comparing.Comparison:
     second = toy_visit("second", motions, turn=3.0)
     frame = np.eye(4)
     frame[:3, :3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0]
@@ -45,8 +52,13 @@ def found(motions: dict[int, np.ndarray], ways: list[Estimate]) -> comparing.Com
         ways[:] = estimated(*visits_and_frame)
         return ways[0], ways[1]
 
+    def kept_too(*visits_and_frame: Any) -> Started:
+        begun.append(started(*visits_and_frame))
+        return begun[-1]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparing, "both_ways", kept)
+        patch.setattr("pipeline.studies.register.both_ways.started", kept_too)
         return compare_visits(toy_visit("first"), second.in_frame(frame))
 
 
@@ -92,37 +104,37 @@ def test_pictures_that_do_not_fit_widen_the_interval(
         assert tooth.deviation == pytest.approx(wider * before), number
 
 
-def test_what_one_way_lost_the_other_finds(motions: dict) -> None:
+def test_what_one_way_lost_the_other_finds(
+    found: comparing.Comparison, begun: list[Started], motions: dict
+) -> None:
     """The pictures of both choose, whichever way is lost, in each other's frame and scale."""
-    first = toy_visit("first")
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = 1.07 * exponential(np.array([0, 0, 0, 0.3, -0.2, 0.5]))[0], 20
-    second = toy_visit("second", motions, turn=3.0).in_frame(frame)
-    numbers = sorted(set(first.teeth) - set(motions))
-    there = started(first, second, inverted(frame), numbers)
-    back = started(second, first, frame, numbers)
+    there, back = begun
+    assert abs(found.relative_scale - 1) > 0.05
     true = solving.displacement(motions[12], there.centres[12])
 
-    def off(found: Started) -> float:
-        state = found.state.motions[12]
-        return solving.travel(solving.displacement(state, found.centres[12]) - true)
+    def off(way: Started) -> float:
+        state = way.state.motions[12]
+        return solving.travel(solving.displacement(state, way.centres[12]) - true)
 
     assert off(there) < 0.2  # both ways found it here
     lost = motion(there.centres[12], (1.4, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert off(agreed(with_motion(there, 12, lost), back)[0]) < 0.2
-    found, mended = agreed(there, with_motion(back, 12, np.eye(4)))
-    assert found.state.motions[12] is there.state.motions[12]
-    again = mirrored(mended.state.motions[12], inverted(frame))
+    kept, mended = agreed(there, with_motion(back, 12, np.eye(4)))
+    assert kept.state.motions[12] is there.state.motions[12]
+    again = mirrored(mended.state.motions[12], there.first_from_second)
     assert np.allclose(again, there.state.motions[12], atol=1e-6)
 
 
-def test_contrast_itself_improves_what_few_photographs_show(motions: dict) -> None:
+def test_contrast_itself_improves_what_few_photographs_show(
+    found: comparing.Comparison, begun: list[Started], motions: dict
+) -> None:
     """And nothing else: not what four photographs show, not a tooth that stood still."""
-    first, second = toy_visit("first"), toy_visit("second", motions, turn=3.0)
-    still = sorted(set(first.teeth) - set(motions))
+    still = sorted(set(found.first.teeth) - set(motions))
+    few = [replace(visit, looks=visit.looks[:3]) for visit in (found.first, found.second)]
     for count in (3, 4):
-        seen = [replace(visit, looks=visit.looks[:count]) for visit in (first, second)]
-        way = started(seen[0], seen[1], np.eye(4), still)
+        way = begun[0]
+        if count == 3:
+            way = started(few[0], few[1], way.first_from_second, still)
         shift = np.eye(4)
         shift[:3, 3] = 0.15, 0.15, 0
         way = with_motion(with_motion(way, 12, shift @ motions[12]), 11, shift)
@@ -174,15 +186,24 @@ def test_teeth_that_stood_still_lie_on_each_other_in_one_frame(
 
 
 def test_nothing_moved_says_so() -> None:
-    found = compare_visits(toy_visit("first"), toy_visit("again", turn=-4.0))
+    first, again = (
+        Visit(whole.name, whole.looks[1:], teeth_points(whole.looks[1:]))
+        for whole in (toy_visit("first"), toy_visit("again", turn=-4.0))
+    )
+    found = compare_visits(first, again)
+    assert len(found.teeth) >= 14
     assert not [tooth.tooth for tooth in found.teeth if tooth.certain]
 
 
 def test_two_patients_are_refused() -> None:
-    anna, berta = (
-        Visit(whole.name, whole.looks[1:3], teeth_points(whole.looks[1:3]))
-        for whole in (toy_visit("anna"), toy_visit("berta", patient=2))
-    )
+    """Of whom one photograph each shows the upper teeth."""
+
+    def seen(whole: Visit) -> Visit:
+        look = whole.looks[1]
+        upper = (replace(look, labels=np.where(look.labels < 30, look.labels, 0)),)
+        return Visit(whole.name, upper, teeth_points(upper))
+
+    anna, berta = seen(toy_visit("anna")), seen(toy_visit("berta", patient=2))
     with pytest.raises(ReconstructionError, match="one patient"):
         compare_visits(anna, berta)
 
