@@ -19,9 +19,11 @@ from stages.init.dental.surface.chart.grid import (
 from stages.init.dental.surface.chart.jaws import teeth_present
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.colour import (
+    Showing,
     blend,
     even_rim,
     find_gains,
+    find_tissue,
     hidden_edges,
     spread_colour,
 )
@@ -284,6 +286,27 @@ def test_rim_of_the_gum_is_even_and_teeth_are_never_cut() -> None:
     assert abs(int(top[105]) - int(top[60])) <= 1
     assert np.abs(np.diff(top[20:-20])).max() <= 2
     assert top[60] == 20 and top[200] == 34
+
+
+def test_crumbs_and_what_is_seen_drawn_out_are_no_tissue() -> None:
+    density, size = 8.0, (200, 400)
+    tooth = np.zeros(size, np.float32)
+    tooth[40:160, 20:180] = 1  # 15 x 20 mm
+    tooth[80:96, 220:260] = 1  # 2 x 5
+    tooth[80:112, 300:340] = 1  # 4 x 5
+
+    def tissue(cosine: float) -> np.ndarray:
+        nothing, all_of_it = np.zeros(size, np.float32), np.ones(size, np.float32)
+        shown = Showing(
+            seen=np.ones(size, bool), facing=np.full(size, cosine, np.float32), tooth=tooth,
+            gum=nothing, colour=np.zeros((*size, 3), np.float32), dull=all_of_it,
+        )  # fmt: skip
+        return find_tissue([shown], density, 0.35, SurfaceOptions().least_showing)[0]
+
+    kept = tissue(0.4)
+    assert kept[100, 100] and kept[96, 320]
+    assert not kept[80:96, 220:260].any()
+    assert not tissue(0.3).any()
 
 
 def test_hidden_edges_go_on_a_little_and_only_on_crowns() -> None:

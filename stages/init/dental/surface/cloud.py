@@ -156,9 +156,7 @@ def _layer(
     showings = in_threads(look, zip(photos, shown, nearest, strict=True), threads)
     gum, edge = beyond_crowns(grid, chart.shape)
     allowed = (gum < options.gum_height) & (edge < PAST_EDGE)
-    kept, tooth = find_tissue(
-        showings, grid.density, options.rim_smoothing, options.least_facing / 2
-    )
+    kept, tooth = find_tissue(showings, grid.density, options.rim_smoothing, options.least_showing)
     kept = even_rim(kept & allowed, tooth > 0.5, gum, grid.density)
     weights = photo_weights(showings, kept, grid.density, options.colour_power)
     return _Layer(chart, grid, points, normals, kept, tooth, showings, weights)

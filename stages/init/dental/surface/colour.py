@@ -29,6 +29,8 @@ _LEAST_TISSUE = 0.5
 _LEAST_VOTE = 0.02
 #: Fringes and gaps narrower than twice this (mm) are cleaned off the rim.
 _RAGGED = 0.8
+#: Smaller pieces (square mm) are left out: half of what the smallest crown shows.
+_CRUMB = 10.0
 #: The gum's rim is made even over this length of the arch (mm).
 _EVEN = 4.0
 #: Shades are what varies over more than this (mm): a highlight on a crown is smaller.
@@ -119,13 +121,13 @@ def find_tissue(
 
 
 def _with_teeth(kept: Mask, tooth: Mask, density: float) -> Mask:
-    """Pieces that carry tooth: at least 4 square mm of it, or a sixth of the piece."""
+    """Pieces that carry tooth, at least 4 square mm of it or a sixth of the piece; no crumbs."""
     count, label = cv2.connectedComponents(kept.astype(np.uint8), connectivity=4)
     area = np.bincount(label.ravel(), minlength=count)
     teeth = np.bincount(label[tooth & kept], minlength=count)
     good = (teeth > 4 * density**2) | (teeth * 6 > area)
     good[0] = False
-    good &= area > density**2
+    good &= area > _CRUMB * density**2
     return good[label]
 
 

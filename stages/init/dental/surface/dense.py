@@ -20,17 +20,21 @@ from pipeline.kernels import kernel_threads
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart.jaws import (
+    FACING_SMOOTHING,
+    HIDDEN,
     PAST_EDGE,
     Chart,
     comparable,
     confidence_of,
+    facing,
     nearest_depths,
     smooth_normals,
     start_chart,
 )
-from stages.init.dental.surface.chart.raster import raster_chart
+from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.cloud import coloured_cloud
 from stages.init.dental.surface.cover import uncovered
+from stages.init.dental.surface.ends import within_rows
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
@@ -154,6 +158,7 @@ def _dense_surface(
         grow_gum(charts, photos, pairs, options, threads)
         _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
     photos = uncovered(charts, photos, options, threads)
+    photos = within_rows(charts, photos, options, threads)
     progress("colour", steps - 1, steps)
     for chart in charts:
         sigma = _AGREEMENT_SMOOTHING * chart.grid.density
@@ -164,7 +169,8 @@ def _dense_surface(
         at_full_size(photo, whole) if full and (whole := full[photo.index]) else photo
         for photo in photos
     ]
-    looks = in_threads(lambda photo: _look(photo, charts, options), shown, threads)
+    clear = _clearly_seen(charts, photos, options, threads)
+    looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
     gains = np.ones((len(images), 3))
     cloud = coloured_cloud(charts, photos, shown, _anchor(photos, fit), options, threads)
     for photo, view, gain in zip(photos, looks, cloud.gains, strict=True):
@@ -232,8 +238,32 @@ def _prepare(
     )  # fmt: skip
 
 
-def _look(photo: Photo, charts: list[Chart], options: SurfaceOptions) -> SurfaceView:
-    """The surface as a photograph sees it: tooth where it shows tooth, gum where it shows gum."""
+def _clearly_seen(
+    charts: list[Chart], photos: list[Photo], options: SurfaceOptions, threads: int
+) -> list[Array32]:
+    """[H, W] float32 0 or 1 per chart: seen by some photograph, and not at too low an angle."""
+    nearest = nearest_depths(charts, photos, options.gum_height, threads)
+
+    def clear(chart: Chart) -> Array32:
+        points = chart.points
+        normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
+        seen = np.zeros(chart.radius.shape, bool)
+        for photo, front in zip(photos, nearest, strict=True):
+            free = photo.sample(photo.covered, photo.project(points)[0]) < 0.5
+            faces = facing(photo, points, normals) > options.least_showing
+            seen |= free & faces & sees(photo, front, points, 2 * HIDDEN)
+        return seen.astype(np.float32)
+
+    return in_threads(clear, charts, threads)
+
+
+def _look(
+    photo: Photo, charts: list[Chart], clear: list[Array32], options: SurfaceOptions
+) -> SurfaceView:
+    """The surface as a photograph sees it: tooth where it shows tooth, gum where it shows gum.
+
+    Without what no photograph sees clearly: `clear` [H, W] is that 0 or 1 per chart.
+    """
     depth = np.zeros(photo.size, np.float32)
     normal = np.zeros((*photo.size, 3), np.float32)
     agreement = np.zeros(photo.size, np.float32)
@@ -243,15 +273,16 @@ def _look(photo: Photo, charts: list[Chart], options: SurfaceOptions) -> Surface
     }
     tissue = own["upper"] | own["lower"]
     certain = np.zeros(photo.size, bool)
-    for chart in charts:
+    for chart, seen in zip(charts, clear, strict=True):
         z, place = raster_chart(photo, chart.points, chart.used(PAST_EDGE, options.gum_height))
+        x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+        z = np.where(cv2.remap(seen, x, y, cv2.INTER_LINEAR) > 0.5, z, 0)
         mine = own[chart.shape.jaw]
         # The photograph itself says which jaw it shows; without a chart of that jaw, the other's.
         better = (z > 0) & tissue & ((depth == 0) | (z < depth)) & ~certain
         better |= (z > 0) & mine
         certain |= (z > 0) & mine
         normals = smooth_normals(chart.radius, chart.grid)
-        x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
         turned = np.asarray(cv2.remap(normals, x, y, cv2.INTER_LINEAR), np.float32)
         turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
         agreed = np.asarray(cv2.remap(chart.agreement, x, y, cv2.INTER_LINEAR))

@@ -53,6 +53,8 @@ class SurfaceOptions:
     outlier: float = 0.6
     # a view takes part where the cosine between normal and line of sight is above this
     least_facing: float = 0.25
+    # a view says what is tooth and what is gum from this cosine: below it shows them drawn out
+    least_showing: float = 0.35
     # pairs of views closer or further apart (degrees) are not compared
     least_pair_angle: float = 12.0
     most_pair_angle: float = 65.0
@@ -63,6 +65,8 @@ class SurfaceOptions:
     carve: bool = False
     # gum shown beyond the crowns, where photographs show gum
     gum_height: float = 4.0
+    # gum shown beyond the last tooth that a photograph shows; None: as far as the chart goes
+    past_row: float | None = 1.5
     # with a larger gum_height the gum beyond this is swept strip by strip, each going on from the
     # last; cameras must be exact for that
     grow_from: float = 5.0

@@ -1,0 +1,95 @@
+"""Cheek beside the last tooth, as red as gum, is not taken for gum."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.init.dental.surface.dense import ArchSurface, dense_surface
+from stages.init.dental.surface.ends import _with_hidden_fronts
+from stages.init.dental.surface.options import SurfaceOptions
+from tests.stages.dental_arch_scene import (
+    AXIS,
+    CROWN_ANGLE,
+    FOCAL,
+    GUM,
+    HEIGHT,
+    TEETH,
+    WIDTH,
+    outline,
+    scene,
+)
+
+#: Where the patient's last upper tooth on the right begins: four to either side.
+END = -3 * CROWN_ANGLE
+PAST = SurfaceOptions().past_row
+
+
+def angles(depth: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """[H, W] about the arches' axis of what a camera sees."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
+    points = (ray * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
+    return np.arctan2(points[..., 0], points[..., 2] + AXIS)
+
+
+@functools.cache
+def with_cheek():  # type: ignore[no-untyped-def]
+    """The scene, where cheek hides the last upper tooth on the right, and its gum."""
+    images, valid, dentitions, fit, truth = scene(missing=TEETH["upper"][0])
+    painted, read, cheeks = [], [], []
+    for image, dentition, view, (depth, jaw, kind) in zip(
+        images, dentitions, fit.views, truth, strict=True
+    ):
+        cheek = (jaw == 1) & (angles(depth, view.cam_from_world) < END)
+        picture = image.copy()
+        picture[cheek] = GUM
+        first, *rest = dentition.upper
+        whole = replace(first, outline=outline((kind == 2) & (jaw == 1) & ~cheek))
+        painted.append(picture)
+        read.append(replace(dentition, upper=(whole, *rest)))
+        cheeks.append(cheek)
+    return painted, valid, read, fit, truth, cheeks
+
+
+@functools.cache
+def surface(past_row: float | None) -> ArchSurface:
+    options = SurfaceOptions(rounds=(), past_row=past_row)
+    return dense_surface(*with_cheek()[:4], options=options, threads=2)
+
+
+def test_what_is_red_beyond_the_last_tooth_is_no_gum() -> None:
+    *_, truth, cheeks = with_cheek()
+    depth, radius = truth[0][0], 24.0
+    angle = angles(depth, with_cheek()[3].views[0].cam_from_world)
+    beyond = cheeks[0] & (angle < END - (PAST + 0.5) / radius)
+    assert beyond.sum() > 100
+    assert (surface(None).views[0].depth > 0)[beyond].mean() > 0.5  # else nothing would be tested
+    assert (surface(PAST).views[0].depth > 0)[beyond].mean() < 0.05
+
+
+def test_all_else_stays() -> None:
+    for cheek, cut, whole in zip(
+        with_cheek()[5], surface(PAST).views, surface(None).views, strict=True
+    ):
+        before = (whole.depth > 0) & ~cheek
+        assert (cut.depth > 0)[before].mean() > 0.98
+
+
+@pytest.mark.parametrize(
+    ("rows", "spans"),
+    [
+        # a deep bite hides the lower front teeth in a photograph from the right
+        ([(-45.0, 12.0), (-40.0, -25.0)], [(-45.0, 12.0), (-40.0, 12.0)]),
+        # and all of the lower jaw's
+        ([(-30.0, 30.0), None], [(-30.0, 30.0), (-20.0, 20.0)]),
+        ([(-45.0, 40.0), (-38.0, 44.0)], [(-45.0, 40.0), (-38.0, 44.0)]),
+    ],
+)
+def test_among_front_teeth_the_other_jaw_tells_as_well(
+    rows: list[tuple[float, float] | None], spans: list[tuple[float, float]]
+) -> None:
+    assert _with_hidden_fronts(rows) == spans
