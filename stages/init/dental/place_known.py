@@ -118,7 +118,7 @@ def from_known_teeth(
     surface = replace(
         surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
         least_facing=LEAST_FACING, least_showing=LEAST_FACING / 2, gum_deviations=GUM_DEVIATIONS,
-        carve=True, past_row=None,
+        carve=True, past_row=None, only_clear=False,
     )  # fmt: skip
     if config.dental.gum_height is None:
         surface = replace(surface, gum_height=GUM_HEIGHT)

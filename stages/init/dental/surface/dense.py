@@ -242,6 +242,8 @@ def _clearly_seen(
     charts: list[Chart], photos: list[Photo], options: SurfaceOptions, threads: int
 ) -> list[Array32]:
     """[H, W] float32 0 or 1 per chart: seen by some photograph, and not at too low an angle."""
+    if not options.only_clear:
+        return [np.ones_like(chart.radius) for chart in charts]
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
 
     def clear(chart: Chart) -> Array32:

@@ -55,6 +55,8 @@ class SurfaceOptions:
     least_facing: float = 0.25
     # a view says what is tooth and what is gum from this cosine: below it shows them drawn out
     least_showing: float = 0.35
+    # whether what no view sees from there has no depth; with exact cameras it is right all the same
+    only_clear: bool = True
     # pairs of views closer or further apart (degrees) are not compared
     least_pair_angle: float = 12.0
     most_pair_angle: float = 65.0
