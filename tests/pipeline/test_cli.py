@@ -128,7 +128,7 @@ def test_kill_at_any_moment_changes_no_byte(toys: Path) -> None:
     slow = (*RUN, "--set", "count.step_seconds=0.03")
     moments = random.Random(0)
     killed = 0
-    while killed < 5:
+    while killed < 8:
         process = subprocess.Popen(
             command(*slow), cwd=toys, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

@@ -93,3 +93,19 @@ def test_among_front_teeth_the_other_jaw_tells_as_well(
     rows: list[tuple[float, float] | None], spans: list[tuple[float, float]]
 ) -> None:
     assert _with_hidden_fronts(rows) == spans
+
+
+@pytest.mark.parametrize("only_clear", [True, False])
+def test_what_all_photographs_see_at_a_low_angle_has_no_depth(only_clear: bool) -> None:
+    """One photograph, from the right: the arch turns away from it on the left."""
+    images, valid, dentitions, fit, truth = scene()
+    view = fit.views[0]
+    alone = replace(fit, views=(view, None, None))
+    options = SurfaceOptions(rounds=(), only_clear=only_clear)
+    shown = dense_surface(images, valid, dentitions, alone, options).views[0].depth > 0
+    depth, _, kind = truth[0]
+    angle = angles(depth, view.cam_from_world)
+    away, towards = (kind == 2) & (angle > 0.6), (kind == 2) & (angle < 0.2)
+    assert away.sum() > 50
+    assert shown[towards].mean() > 0.95
+    assert shown[away].mean() < 0.15 if only_clear else shown[away].mean() > 0.5

@@ -16,7 +16,6 @@ from stages.init.dental.surface.chart.jaws import (
     Chart,
     confidence_of,
     facing,
-    nearest_depths,
     smooth_normals,
 )
 from stages.init.dental.surface.chart.raster import raster_chart, sees
@@ -75,6 +74,7 @@ def coloured_cloud(
     charts: list[Chart],
     photos: list[Photo],
     shown: list[Photo],
+    nearest: list[Array32],
     anchor: int,
     options: SurfaceOptions,
     threads: int,
@@ -85,11 +85,11 @@ def coloured_cloud(
         charts: of the jaws.
         photos: the photographs, to tell what hides what.
         shown: the same at the size that colours are taken from.
+        nearest: per photograph the z-depth [h, w] of the nearest chart.
         anchor: the photograph whose exposure the others are brought to.
         options: settings.
         threads: number of threads.
     """
-    nearest = nearest_depths(charts, photos, options.gum_height, threads)
     layers = [_layer(chart, photos, shown, nearest, options, threads) for chart in charts]
     gains = find_gains(
         [[showing.colour for showing in layer.showings] for layer in layers],

@@ -24,7 +24,6 @@ from stages.init.dental.surface.chart.jaws import (
     PAST_EDGE,
     Chart,
     facing,
-    nearest_depths,
     smooth_normals,
 )
 from stages.init.dental.surface.chart.raster import raster_chart, sees
@@ -68,8 +67,9 @@ class _Look:
 
 
 def uncovered(
-    charts: list[Chart], photos: list[Photo], options: SurfaceOptions, threads: int
-) -> list[Photo]:
+    charts: list[Chart], photos: list[Photo], nearest: list[Array32], options: SurfaceOptions,
+    threads: int,
+) -> list[Photo]:  # fmt: skip
     """The photographs with what stands before the teeth and the gum marked, and no longer gum.
 
     A crown is looked for only where another photograph shows it from further in front, and gum by
@@ -78,10 +78,10 @@ def uncovered(
     Args:
         charts: of the jaws, about where the surface is.
         photos: the photographs as they were prepared.
+        nearest: per photograph the z-depth [h, w] of the nearest chart.
         options: settings.
         threads: number of threads; does not change the result.
     """
-    nearest = nearest_depths(charts, photos, options.gum_height, threads)
     covered = [np.zeros(photo.size, bool) for photo in photos]
     contested = [np.zeros(photo.size, bool) for photo in photos]
     for chart in charts:

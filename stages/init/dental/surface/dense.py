@@ -20,18 +20,16 @@ from pipeline.kernels import kernel_threads
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart.jaws import (
-    FACING_SMOOTHING,
-    HIDDEN,
     PAST_EDGE,
     Chart,
+    clearly_seen,
     comparable,
     confidence_of,
-    facing,
     nearest_depths,
     smooth_normals,
     start_chart,
 )
-from stages.init.dental.surface.chart.raster import raster_chart, sees
+from stages.init.dental.surface.chart.raster import raster_chart
 from stages.init.dental.surface.cloud import coloured_cloud
 from stages.init.dental.surface.cover import uncovered
 from stages.init.dental.surface.ends import within_rows
@@ -157,8 +155,9 @@ def _dense_surface(
     if pairs and options.rounds and options.gum_height > options.grow_from:
         grow_gum(charts, photos, pairs, options, threads)
         _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
-    photos = uncovered(charts, photos, options, threads)
-    photos = within_rows(charts, photos, options, threads)
+    nearest = nearest_depths(charts, photos, options.gum_height, threads)
+    photos = uncovered(charts, photos, nearest, options, threads)
+    photos = within_rows(charts, photos, nearest, options, threads)
     progress("colour", steps - 1, steps)
     for chart in charts:
         sigma = _AGREEMENT_SMOOTHING * chart.grid.density
@@ -169,10 +168,14 @@ def _dense_surface(
         at_full_size(photo, whole) if full and (whole := full[photo.index]) else photo
         for photo in photos
     ]
-    clear = _clearly_seen(charts, photos, options, threads)
+    clear: list[Mask | None] = [
+        clearly_seen(chart, photos, nearest, options) if options.only_clear else None
+        for chart in charts
+    ]
     looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
     gains = np.ones((len(images), 3))
-    cloud = coloured_cloud(charts, photos, shown, _anchor(photos, fit), options, threads)
+    anchor = _anchor(photos, fit)
+    cloud = coloured_cloud(charts, photos, shown, nearest, anchor, options, threads)
     for photo, view, gain in zip(photos, looks, cloud.gains, strict=True):
         views[photo.index], gains[photo.index] = view, gain
     progress("colour", steps, steps)
@@ -238,33 +241,12 @@ def _prepare(
     )  # fmt: skip
 
 
-def _clearly_seen(
-    charts: list[Chart], photos: list[Photo], options: SurfaceOptions, threads: int
-) -> list[Array32]:
-    """[H, W] float32 0 or 1 per chart: seen by some photograph, and not at too low an angle."""
-    if not options.only_clear:
-        return [np.ones_like(chart.radius) for chart in charts]
-    nearest = nearest_depths(charts, photos, options.gum_height, threads)
-
-    def clear(chart: Chart) -> Array32:
-        points = chart.points
-        normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
-        seen = np.zeros(chart.radius.shape, bool)
-        for photo, front in zip(photos, nearest, strict=True):
-            free = photo.sample(photo.covered, photo.project(points)[0]) < 0.5
-            faces = facing(photo, points, normals) > options.least_showing
-            seen |= free & faces & sees(photo, front, points, 2 * HIDDEN)
-        return seen.astype(np.float32)
-
-    return in_threads(clear, charts, threads)
-
-
 def _look(
-    photo: Photo, charts: list[Chart], clear: list[Array32], options: SurfaceOptions
+    photo: Photo, charts: list[Chart], clear: list[Mask | None], options: SurfaceOptions
 ) -> SurfaceView:
     """The surface as a photograph sees it: tooth where it shows tooth, gum where it shows gum.
 
-    Without what no photograph sees clearly: `clear` [H, W] is that 0 or 1 per chart.
+    Per chart `clear` [H, W] bool says where it has depth; None: everywhere.
     """
     depth = np.zeros(photo.size, np.float32)
     normal = np.zeros((*photo.size, 3), np.float32)
@@ -278,7 +260,8 @@ def _look(
     for chart, seen in zip(charts, clear, strict=True):
         z, place = raster_chart(photo, chart.points, chart.used(PAST_EDGE, options.gum_height))
         x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
-        z = np.where(cv2.remap(seen, x, y, cv2.INTER_LINEAR) > 0.5, z, 0)
+        if seen is not None:
+            z = z * (cv2.remap(seen.astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.5)
         mine = own[chart.shape.jaw]
         # The photograph itself says which jaw it shows; without a chart of that jaw, the other's.
         better = (z > 0) & tissue & ((depth == 0) | (z < depth)) & ~certain

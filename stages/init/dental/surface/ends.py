@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.kernels.threads import in_threads
-from stages.init.dental.surface.chart.jaws import HIDDEN, PAST_EDGE, Chart, nearest_depths
+from stages.init.dental.surface.chart.jaws import HIDDEN, PAST_EDGE, Chart
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photo import Photo, disc
@@ -35,20 +35,21 @@ Span = tuple[float, float]
 
 
 def within_rows(
-    charts: list[Chart], photos: list[Photo], options: SurfaceOptions, threads: int
-) -> list[Photo]:
+    charts: list[Chart], photos: list[Photo], nearest: list[Array32], options: SurfaceOptions,
+    threads: int,
+) -> list[Photo]:  # fmt: skip
     """The photographs with what they show `options.past_row` mm beyond their teeth no longer gum.
 
     Args:
         charts: of the jaws, where the surface is.
         photos: the photographs.
+        nearest: per photograph the z-depth [h, w] of the nearest chart.
         options: settings.
         threads: number of threads; does not change the result.
     """
     if options.past_row is None:
         return photos
     past = options.past_row
-    nearest = nearest_depths(charts, photos, options.gum_height, threads)
 
     def cut(item: tuple[Photo, Array32]) -> Photo:
         photo, front = item
@@ -60,9 +61,7 @@ def within_rows(
             near = (depth > 0) & (depth < front + np.float32(HIDDEN))
             arc = chart.grid.left + place[..., 0] / chart.grid.density
             beyond |= near & ((arc < first - past) | (arc > last + past))
-        tooth = (photo.upper > 0) | (photo.lower > 0)
-        beyond &= ~tooth
-        free = (~beyond).astype(np.float32)
+        free = (~beyond | (photo.upper > 0) | (photo.lower > 0)).astype(np.float32)
         return replace(
             photo, upper_gum=photo.upper_gum * free, lower_gum=photo.lower_gum * free,
             covered=np.maximum(photo.covered, 1 - free),

@@ -167,6 +167,23 @@ def comparable(
     return np.stack(masks)
 
 
+def clearly_seen(
+    chart: Chart,
+    photos: list[Photo],
+    nearest: list[Array32],
+    options: SurfaceOptions,
+) -> Mask:
+    """[H, W] bool: samples of a chart that some photograph shows, and not at too low an angle."""
+    points = chart.points
+    normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
+    clear = np.zeros(chart.grid.shape, bool)
+    for photo, front in zip(photos, nearest, strict=True):
+        free = photo.sample(photo.covered, photo.project(points)[0]) < 0.5
+        faces = facing(photo, points, normals) > options.least_showing
+        clear |= free & faces & sees(photo, front, points, 2 * HIDDEN)
+    return clear
+
+
 def _near_tissue(photo: Photo, jaw: Jaw) -> Array32:
     """[h, w] float32: this jaw's teeth and gum and what is next to them."""
     tissue = np.maximum(photo.tooth_of(jaw), photo.gum_of(jaw))
