@@ -3,14 +3,14 @@
     python benchmarks/triads.py --data DIR [--out DIR] [--only CASE,...] [--mixes N] [--series]
                                 [--leave-one-out] [--threads 2] [--jobs 1] [--set FIELD=VALUE ...]
 
-DIR holds `triads/` (three photographs and `truth.json` per patient) and `series/` (everything that
-a clinic took). Each case goes through the stages views, teeth and init as on the command line
-(init.method=dental, or as --set says). --mixes adds up to N mixes (120: all six sorts) of which
-none may become a scene unless what is wrong is put right: sides swapped in the file names must
-pass like the case itself. --series gives whole folders. OUT gets `triads.json` with every figure,
-`curve.png`, contact sheets (`cases_*.png`, `turned_*.png`, `series_*.png`, `mixes_*.png`: mixes
-that were accepted) and `readings/`, which makes the next run quicker: readings count again where
-neither the photograph nor the reader has changed.
+DIR holds `triads/` (three photographs and `truth.json` per patient) and perhaps `series/`
+(everything that a clinic took). Each case goes through the stages views, teeth and init as on the
+command line (init.method=dental, or as --set says). --mixes adds up to N mixes (120: all six
+sorts) of which none may become a scene unless what is wrong is put right: sides swapped in the
+file names must pass like the case itself. --series gives whole folders. OUT gets `triads.json`
+with every figure, `curve.png`, contact sheets (`cases_*.png`, `turned_*.png`, `series_*.png`,
+`mixes_*.png`: mixes that were accepted) and `readings/`, which makes the next run quicker:
+readings count again where neither the photograph nor the reader has changed.
 
 Found: a truth point lies inside a crown. Right: that crown has the point's number. A wrong number
 that is shown as doubtful is listed (with ?), but does not make a scene wrong. Points on crowns

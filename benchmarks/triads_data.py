@@ -108,10 +108,11 @@ def read_cases(data: Path, only: tuple[str, ...] = ()) -> list[Item]:
 
 
 def read_series(data: Path, cases: list[Item]) -> list[Item]:
-    """Everything that a clinic took of some of the patients, with the truth of the triads."""
+    """Everything that a clinic took of some of the patients, with the truth of the triads; none
+    where there is no `series/`."""
     truths = {(case.name, photo.path.stem): photo.truth for case in cases for photo in case.photos}
     found = []
-    for folder in sorted((data / "series").iterdir()):
+    for folder in sorted((data / "series").glob("*/")):
         if folder.name not in {case.name for case in cases}:
             continue
         photos = tuple(

@@ -11,6 +11,7 @@ from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
 from stages.init.dental.numbering.confidence import Evidence, same_mouth
+from stages.init.dental.numbering.edits import Margins
 
 ENAMEL, GUM = (0.62, 0.55, 0.42), (0.38, 0.16, 0.15)  # linear light
 
@@ -57,7 +58,9 @@ def test_a_photograph_without_gum_says_nothing() -> None:
 def evidence(one_light: float, any_light: float, common: float, share: float) -> Evidence:
     colours = [ColourDistance(1.0, 1.0)] * 2 + [ColourDistance(one_light, any_light)]
     pairs = {(0, 1): PairFigures(50, 0.04, 0.005), (1, 2): PairFigures(50, share, 0.005)}
-    return Evidence((30.0, 30.0, 30.0), [60.0, 60.0, common], {}, colours, [100.0] * 3, pairs)
+    return Evidence(
+        Margins(30.0, 30.0, 30.0), [60.0, 60.0, common], {}, colours, [100.0] * 3, pairs
+    )
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
         raise
     for doubt in (
         *teeth.fit.doubts, *in_another_light(names, teeth), *turned_back(names, teeth),
-        *misnamed(names, teeth),
+        *misnamed(names, teeth), *numbered_otherwise(teeth, config.dental.min_margin),
     ):  # fmt: skip
         context.warn(doubt)
     numbered = updated(read, [d for d in teeth.dentitions if d is not None])
@@ -104,6 +104,19 @@ def in_another_light(names: list[str], teeth: Reconstruction) -> list[str]:
         "(phones choose one for each photograph). Teeth and gums agree in what that does not "
         "change; if it shows another patient all the same, leave it out. --set fit.exposure=true "
         "evens the colours out."
+    ]
+
+
+def numbered_otherwise(teeth: Reconstruction, min_margin: float) -> list[str]:
+    """What to say where other numbers of teeth that one photograph shows are nearly as good."""
+    margin = teeth.fit.figures.get("numbers_margin", np.inf)
+    if margin >= min_margin:
+        return []
+    return [
+        f"Another numbering explains the photographs nearly as well (margin {margin:.0f}, wanted "
+        f"{min_margin:.0f}). It renames teeth that one photograph alone shows, such as those "
+        "behind a tooth that may be missing: the scene does not rest on it, their numbers are "
+        "marked. Check them on the page check.html."
     ]
 
 

@@ -161,7 +161,7 @@ def fit_arch(
             scorer, best, others, primary = child, rival, rivals, rival_primary
     best, ends = settle_ends(scorer, best, fixed)
     gaps = margins(best, others)
-    shares = label_doubts(best, [*others, *ends])
+    shares = label_doubts(best, [*others, *ends], options.min_margin)
     if primary != best.labelling.primary:
         start = (best.adjusted.unknowns, best.adjusted.offsets)
         best = scorer.solve(replace(best.labelling, primary=primary), start)
@@ -176,7 +176,7 @@ def fit_arch(
     more, figures = fit_doubts(shown, scorer, best, evidence, options)
     doubts += more + _kind_doubts(best, read, shown)
     found = _outcome(
-        scorer, best, read, placeable, len(dentitions), min(gaps[:2]), doubts, figures, shares
+        scorer, best, read, placeable, len(dentitions), gaps.cameras, doubts, figures, shares
     )
     turned = {placeable[view] for view, factor in mirrored.items() if factor > MIRRORED}
     return replace(found, mirrored=tuple(sorted(turned)))

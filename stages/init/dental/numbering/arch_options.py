@@ -75,14 +75,19 @@ class ArchOptions:
     any_light_match_weight: float = 3.0
     usual_share: float = 0.008
     any_light_cost: float = 5.0
-    #: Median landmark error above which the fit is doubted.
-    max_error: float = 0.045
-    #: Standard deviation of the angle between neighbouring views above which it is doubted.
-    max_angle_deviation: float = 8.0
+    #: Median landmark error above which the fit is doubted. This limit, the next one, that of
+    #: epipolar errors and `confidence.EDGE` lie a third above the most that twelve patients came
+    #: to, each also altered in seven ways. None of 187 mixes of two patients, nor of 69 with
+    #: mirror images or open jaws, was refused for one of the four alone.
+    max_error: float = 0.055
+    #: Standard deviation of the angle between neighbouring views above which it is doubted. It
+    #: tells the truth: angles of the altered photographs differ from those of the others by .9 of
+    #: it, 3 degrees (root mean square of 168).
+    max_angle_deviation: float = 10.0
     #: Share of the crowns, those at the ends of the rows apart, left without a number above which
     #: a photograph is doubted: a third. (At most .11 in twelve patients; no mix of patients or of
     #: mirror images was refused for this alone.)
     max_unnamed: float = 0.34
     #: Median distance of dense matches from their epipolar lines above which a pair is doubted, as
     #: a share of the band.
-    max_epipolar_error: float = 0.03
+    max_epipolar_error: float = 0.036

@@ -14,13 +14,15 @@ from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance
+from stages.init.dental.numbering.edits import Margins
 from stages.init.dental.numbering.hypotheses import Scored, Scorer
 from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
 
 Array = npt.NDArray[np.float64]
 
-#: Prior standard deviations off, beyond which a pose is said to be at the edge.
-EDGE = 2.6
+#: Prior standard deviations off, beyond which a pose is said to be at the edge: a tilt by 24
+#: degrees from what is usual; photographs of children come to 18.
+EDGE = 3.0
 #: Evidence beyond the least margin, and sureness of one mouth, that raise the odds by a factor e.
 MARGIN_UNIT, SAME_MOUTH_UNIT = 4.0, 1.5
 #: Names of what the unknowns of a view are.
@@ -61,7 +63,7 @@ class Evidence:
     """What a fit can be doubted for.
 
     Attributes:
-        margins: by how much its labelling beats the next, as `edits.margins` has it.
+        margins: by how much its labelling beats others.
         common_mouth: per photograph, twice the log Bayes factor that it shows the same mouth as the
             others (`edits.common_mouth`).
         mirrored: of photographs from the front, twice the log Bayes factor that they are mirror
@@ -71,7 +73,7 @@ class Evidence:
         pairs: how the dense matches of pairs agree.
     """
 
-    margins: tuple[float, float, float]
+    margins: Margins
     common_mouth: Sequence[float]
     mirrored: Mapping[int, float]
     colours: Sequence[ColourDistance]
@@ -149,8 +151,9 @@ def fit_doubts(
     """
     adjusted, labelling = best.adjusted, best.labelling
     figures: dict[str, float] = {
-        "margin": min(evidence.margins[:2]),
-        "local_margin": evidence.margins[2],
+        "margin": evidence.margins.cameras,
+        "numbers_margin": evidence.margins.numbers,
+        "local_margin": evidence.margins.local,
     }
     doubts: list[str] = []
     if figures["margin"] < options.min_margin:

@@ -1,0 +1,79 @@
+"""Rivals of a labelling: those that turn cameras, those that rename what one photograph shows."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+from stages.init.dental.numbering.edits import (
+    LEAST_DOUBT,
+    NEAR_DOUBT,
+    Margins,
+    differences,
+    label_doubts,
+    margins,
+)
+from stages.init.dental.numbering.hypotheses import Labelling, Scored
+from stages.init.dental.place import numbered_otherwise
+
+#: Upper and lower rows of a photograph from the right, from the front and from the left.
+RIGHT = ((0, 1, 2, 3, 4, 5, 6, 7), (0, 1, 2, 3, 4, 5, 6, 7))
+FRONT = ((3, 4, 5, 6, 7, 8, 9, 10), (3, 4, 5, 6, 7, 8, 9, 10))
+LEFT = ((6, 7, 8, 9, 10, 11, 12, 13), (6, 7, 8, 9, 10, 11, 12, 13))
+#: The first premolar (position 3) missing: what lies behind it, on the right alone, is renamed.
+GAP = ((-1, 0, 1, 2, 4, 5, 6, 7), RIGHT[1])
+#: The photograph from the left a tooth further back.
+MOVED = ((7, 8, 9, 10, 11, 12, 13, -1), LEFT[1])
+
+
+def scored(score: float, *labels: Any) -> Scored:
+    labelling = Labelling(views=(0, 1, 2), roles=("right", "frontal", "left"), labels=labels)
+    return cast(Scored, SimpleNamespace(labelling=labelling, score=score))
+
+
+def test_what_one_photograph_alone_shows_ties_nothing() -> None:
+    best, gap, moved = (
+        scored(0, *labels).labelling
+        for labels in ((RIGHT, FRONT, LEFT), (GAP, FRONT, LEFT), (RIGHT, FRONT, MOVED))
+    )
+    assert differences(best, best) == (0, 0)
+    # Of positions 0 to 3, the first is an end of the row; the last is seen from the front, too.
+    assert differences(best, gap) == differences(gap, best) == (3, 1)
+    # From the left all six inner crowns; four of them are seen from the front by one or the other.
+    assert differences(best, moved) == (6, 4)
+
+
+def test_a_shift_of_all_photographs_ties_them_otherwise() -> None:
+    everything = [tuple(tuple(k + 1 for k in row) for row in view) for view in (RIGHT, FRONT)]
+    best, shifted = scored(0, RIGHT, FRONT, LEFT), scored(3, *everything, MOVED)
+    assert margins(best, [shifted]).cameras == 3
+
+
+def test_margins_are_told_apart() -> None:
+    best = scored(10, RIGHT, FRONT, LEFT)
+    one = ((0, 1, 2, 3, 4, 5, 7, 8), RIGHT[1])
+    others = [
+        scored(12, one, FRONT, LEFT), scored(15, GAP, FRONT, LEFT), scored(30, RIGHT, FRONT, MOVED),
+        scored(17, GAP, FRONT, LEFT),
+    ]  # fmt: skip
+    assert margins(best, others) == Margins(cameras=20, numbers=5, local=2)
+    assert margins(best, [best]) == Margins(math.inf, math.inf, math.inf)
+
+
+def test_numbers_that_a_near_rival_has_otherwise_are_marked() -> None:
+    best, rival = scored(0, RIGHT, FRONT, LEFT), scored(5.5, GAP, FRONT, LEFT)
+    (upper, lower), front, left = label_doubts(best, [rival], least_margin=6.0)
+    assert upper[:4] == (NEAR_DOUBT,) * 4
+    assert {*upper[4:], *lower, *front[0], *left[0]} == {LEAST_DOUBT}
+    far = label_doubts(best, [rival], least_margin=5.0)
+    assert LEAST_DOUBT < far[0][0][0] < 0.1
+
+
+def test_it_is_said() -> None:
+    near = cast(Any, SimpleNamespace(fit=SimpleNamespace(figures={"numbers_margin": 5.2})))
+    (sentence,) = numbered_otherwise(near, 6.0)
+    assert "margin 5, wanted 6" in sentence
+    assert numbered_otherwise(near, 5.0) == []
+    none = cast(Any, SimpleNamespace(fit=SimpleNamespace(figures={})))
+    assert numbered_otherwise(none, 6.0) == []
