@@ -13,6 +13,7 @@ from stages.init.dental.numbering.edits import (
     differences,
     label_doubts,
     margins,
+    shifted_labellings,
 )
 from stages.init.dental.numbering.hypotheses import Labelling, Scored
 from stages.init.dental.place import numbered_otherwise
@@ -48,6 +49,19 @@ def test_a_shift_of_all_photographs_ties_them_otherwise() -> None:
     everything = [tuple(tuple(k + 1 for k in row) for row in view) for view in (RIGHT, FRONT)]
     best, shifted = scored(0, RIGHT, FRONT, LEFT), scored(3, *everything, MOVED)
     assert margins(best, [shifted]).cameras == 3
+
+
+def test_both_sides_are_shifted_at_once() -> None:
+    """A lower jaw that both sides show a tooth too far back: half way back is worse than none."""
+    right, left = ((*RIGHT[0],), (*RIGHT[1],)), ((*LEFT[0],), (*LEFT[1],))
+    off = (right[0], (-1, *right[1][:-1])), (left[0], (*left[1][1:], -1))
+    best = scored(0, off[0], FRONT, off[1]).labelling
+    tried = shifted_labellings(best)
+    assert len(tried) == len(set(tried))
+    back = (right[0], (-1, *right[1][1:])), (left[0], (*left[1][:-1], -1))
+    assert any(labelling.labels == (back[0], FRONT, back[1]) for labelling in tried)
+    many = Labelling(tuple(range(5)), ("frontal",) * 5, (FRONT,) * 5)
+    assert len(shifted_labellings(many)) == 3 * 2 * (5 + 1)  # of more, only one or all
 
 
 def test_margins_are_told_apart() -> None:

@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +47,8 @@ TRIAL_STEPS = 6
 MIN_GAIN = 1.0
 #: Edits taken one after another at most.
 MAX_EDITS = 6
+#: Up to so many photographs, shifts of two at once are tried.
+FEW_VIEWS = 4
 #: Labellings next to the best that are solved to the end, to know the margin.
 NEAREST = 5
 #: Labellings that look less likely than the present one by more than this (evidence) are not tried.
@@ -338,20 +340,31 @@ def _shown(labelling: Labelling) -> dict[tuple[int, int], set[int]]:
 
 
 def shifted_labellings(labelling: Labelling) -> list[Labelling]:
-    """Labellings a tooth off: one view or all, one jaw or both."""
-    views = range(len(labelling.labels))
-    result = []
-    for chosen in [[number] for number in views] + [list(views)]:
-        for jaws in ((0, 1), (0,), (1,)):
-            for by in (-1, 1):
-                changed = labelling
-                for number in chosen:
-                    for jaw in jaws:
-                        row = labelling.labels[number][jaw]
-                        new = _bounded(_shifted(row, [True] * len(row), by))
-                        changed = with_row(changed, number, jaw, new)
-                result.append(changed)
-    return result
+    """Labellings a tooth off: one view or all, or two of a few each its own way; one jaw or both.
+
+    Where both sides are off, each half way back is worse than none: the two are tried at once.
+    """
+    count = len(labelling.labels)
+    moves = [{view: by} for view in range(count) for by in (-1, 1)]
+    moves += [dict.fromkeys(range(count), by) for by in (-1, 1)]
+    if count <= FEW_VIEWS:
+        for pair in combinations(range(count), 2):
+            both = product((-1, 1), repeat=2)
+            moves += [dict(zip(pair, steps, strict=True)) for steps in both]
+    result = {
+        _moved(labelling, move, jaws): None for move in moves for jaws in ((0, 1), (0,), (1,))
+    }
+    return list(result)
+
+
+def _moved(labelling: Labelling, steps: dict[int, int], jaws: tuple[int, ...]) -> Labelling:
+    """The labelling with the rows of some views so many teeth further along."""
+    for number, by in steps.items():
+        for jaw in jaws:
+            row = labelling.labels[number][jaw]
+            new = _bounded(_shifted(row, [True] * len(row), by))
+            labelling = with_row(labelling, number, jaw, new)
+    return labelling
 
 
 def solve_shifted(scorer: Scorer, best: Scored, fixed: Fixed) -> list[Scored]:
