@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from triads_run import Outcome
 from pipeline.artifacts.dental.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.overlay import DOUBT_SHOWN
+from stages.dentition.working import working_scale
 
 if TYPE_CHECKING:
     from stages.init.dental.solution import PlacedView
@@ -213,10 +215,11 @@ def epipolar_error(outcome: Outcome) -> Row | None:
     if outcome.fit is None or outcome.teeth is None:
         return None
     by_name = outcome.teeth.by_name()
+    # The fit saw the photographs at their working size.
     seen = [
-        (by_name[name], placed)
+        (read, replace(placed, focal=placed.focal / working_scale(*read.size)))
         for name, placed in zip(outcome.fitted, outcome.fit.views, strict=True)
-        if placed is not None and name in by_name
+        if placed is not None and (read := by_name.get(name)) is not None
     ]
     distances, shares = [], []
     for (first, one), (second, two) in combinations(seen, 2):
