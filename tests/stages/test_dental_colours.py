@@ -11,7 +11,7 @@ from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
 from stages.init.dental.numbering.confidence import Evidence, same_mouth
-from stages.init.dental.numbering.edits import Margins
+from stages.init.dental.numbering.rivals import Margins
 
 ENAMEL, GUM = (0.62, 0.55, 0.42), (0.38, 0.16, 0.15)  # linear light
 

@@ -6,16 +6,16 @@ import math
 from types import SimpleNamespace
 from typing import Any, cast
 
-from stages.init.dental.numbering.edits import (
+from stages.init.dental.numbering.edits import shifted_labellings
+from stages.init.dental.numbering.hypotheses import Labelling, Scored
+from stages.init.dental.numbering.rivals import (
     LEAST_DOUBT,
     NEAR_DOUBT,
     Margins,
     differences,
     label_doubts,
     margins,
-    shifted_labellings,
 )
-from stages.init.dental.numbering.hypotheses import Labelling, Scored
 from stages.init.dental.place import numbered_otherwise
 
 #: Upper and lower rows of a photograph from the right, from the front and from the left.

@@ -36,8 +36,6 @@ from stages.init.dental.numbering.edits import (
     Fixed,
     common_mouth,
     improve,
-    label_doubts,
-    margins,
     settle_ends,
     solve_shifted,
 )
@@ -51,6 +49,7 @@ from stages.init.dental.numbering.hypotheses import (
 )
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
 from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
+from stages.init.dental.numbering.rivals import label_doubts, margins
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at

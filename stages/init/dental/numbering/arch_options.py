@@ -80,9 +80,9 @@ class ArchOptions:
     #: to, each also altered in seven ways. None of 187 mixes of two patients, nor of 69 with
     #: mirror images or open jaws, was refused for one of the four alone.
     max_error: float = 0.055
-    #: Standard deviation of the angle between neighbouring views above which it is doubted. It
-    #: tells the truth: angles of the altered photographs differ from those of the others by .9 of
-    #: it, 3 degrees (root mean square of 168).
+    #: Standard deviation of the angle between neighbouring views above which it is doubted. It says
+    #: how far photographs of one mouth, altered, move it: by .9 of it, 3 degrees (root mean square
+    #: of 168). It does not know how far the arch's proportions are from the textbook's.
     max_angle_deviation: float = 10.0
     #: Share of the crowns, those at the ends of the rows apart, left without a number above which
     #: a photograph is doubted: a third. (At most .11 in twelve patients; no mix of patients or of

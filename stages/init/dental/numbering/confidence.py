@@ -14,9 +14,9 @@ from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance
-from stages.init.dental.numbering.edits import Margins
 from stages.init.dental.numbering.hypotheses import Scored, Scorer
 from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
+from stages.init.dental.numbering.rivals import Margins
 
 Array = npt.NDArray[np.float64]
 

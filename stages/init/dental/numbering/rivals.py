@@ -1,0 +1,127 @@
+"""By how much a labelling beats its rivals, and which numbers these leave in doubt."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.dentition.tooth_rows import NO_TOOTH
+from stages.init.dental.numbering.hypotheses import Labelling, Scored, ViewLabels
+
+Doubts = tuple[float, ...]
+
+#: No number is surer than this: a doubt of 0 means that a person has said it.
+LEAST_DOUBT = 1e-4
+#: Least doubt of a crown that another labelling, nearly as good, names otherwise: it is marked.
+NEAR_DOUBT = 0.12
+#: Labellings count as different ones when they name more crowns differently than this that tie the
+#: photographs to each other.
+SAME_BUT_FOR = 2
+
+
+@dataclass(frozen=True)
+class Margins:
+    """By how much a labelling beats others (log evidence, twice); infinite where there are none.
+
+    Attributes:
+        cameras: over those that match the photographs to each other in another way.
+        numbers: over those that rename several crowns, but nearly all of them shown by no other
+            photograph: numbers would change, the scene would hardly.
+        local: over those that rename a crown or two.
+    """
+
+    cameras: float = math.inf
+    numbers: float = math.inf
+    local: float = math.inf
+
+
+def margins(best: Scored, others: list[Scored]) -> Margins:
+    """By how much the best labelling beats others of each sort."""
+    sorts: list[list[float]] = [[], [], []]
+    for other in others:
+        count, shared = differences(best.labelling, other.labelling)
+        if count:
+            sort = 0 if shared > SAME_BUT_FOR else 1 if count > SAME_BUT_FOR else 2
+            sorts[sort].append(other.score - best.score)
+    return Margins(*(min(gaps, default=math.inf) for gaps in sorts))
+
+
+def differences(a: Labelling, b: Labelling) -> tuple[int, int]:
+    """How many crowns two labellings name differently, the ends of the rows apart.
+
+    Returns:
+        All of them, and those that by either labelling another photograph shows as well. These
+        alone tie the photographs to each other: the others can be renamed, and no camera turns.
+    """
+    shown = [_shown(a), _shown(b)]
+    count = shared = 0
+    for view, (mine, theirs) in enumerate(zip(a.labels, b.labels, strict=True)):
+        for jaw in (0, 1):
+            inner = slice(1, -1)
+            for both in zip(mine[jaw][inner], theirs[jaw][inner], strict=True):
+                if both[0] == both[1] or NO_TOOTH in both:
+                    continue
+                count += 1
+                shared += any(
+                    by[jaw, label] - {view} for by, label in zip(shown, both, strict=True)
+                )
+    return count, shared
+
+
+def _shown(labelling: Labelling) -> dict[tuple[int, int], set[int]]:
+    """(Jaw, position) -> the photographs that show this tooth."""
+    found: dict[tuple[int, int], set[int]] = defaultdict(set)
+    for view, both in enumerate(labelling.labels):
+        for jaw, row in enumerate(both):
+            for label in row:
+                found[jaw, label].add(view)
+    return found
+
+
+def label_doubts(
+    best: Scored, others: list[Scored], least_margin: float
+) -> list[tuple[Doubts, Doubts]]:
+    """Probability, view by view and row by row, that each crown's label is another one.
+
+    Every labelling that was solved counts by its evidence; of equal ones the best counts. What one
+    of `Margins.numbers` within the least margin calls otherwise has `NEAR_DOUBT` at least.
+
+    Args:
+        best: the labelling chosen.
+        others: all others that were solved.
+        least_margin: below this another labelling is nearly as good.
+    """
+    found: dict[tuple[ViewLabels, ...], Scored] = {}
+    for scored in (best, *others):
+        labels = scored.labelling.labels
+        known = found.get(labels)
+        if len(labels) == len(best.labelling.labels) and (
+            known is None or scored.score < known.score
+        ):
+            found[labels] = scored
+    least = min(scored.score for scored in found.values())
+    weights = {labels: np.exp(-(s.score - least) / 2) for labels, s in found.items()}
+    total = sum(weights.values())
+    near = [
+        labels
+        for labels, scored in found.items()
+        if scored.score < best.score + least_margin
+        and differences(best.labelling, scored.labelling)[0] > SAME_BUT_FOR
+    ]
+
+    def doubt(number: int, jaw: int, k: int) -> float:
+        label = best.labelling.labels[number][jaw][k]
+        share = sum(w for other, w in weights.items() if other[number][jaw][k] != label) / total
+        rivalled = any(other[number][jaw][k] != label for other in near)
+        return float(np.clip(share, NEAR_DOUBT if rivalled else LEAST_DOUBT, 1.0))
+
+    result = []
+    for number, chosen in enumerate(best.labelling.labels):
+        upper, lower = (
+            tuple(doubt(number, jaw, k) for k in range(len(row))) for jaw, row in enumerate(chosen)
+        )
+        result.append((upper, lower))
+    return result
