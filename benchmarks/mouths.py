@@ -1,0 +1,165 @@
+"""Three photographs of generated mouths: are the numbers and the angles between cameras right?
+
+    python benchmarks/mouths.py --count 30 [--first 0] [--jobs 2] [--out DIR]
+
+Every photograph has a lens, a distance, a crop and a light of its own, so that most are refused for
+their colours: numbers and angles are those of the fit, whatever becomes of it. Angles are between
+the photograph from the front and those from the sides, after the fit's own roll; what the fit
+believes is the standard deviation that it gives itself. OUT keeps photographs and readings, which
+makes the next run quicker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from triads_data import CASE, Item, Photo
+from triads_run import Outcome, Runner
+
+from pipeline.geometry.rigid import angle_between
+from stages.dentition.overlay import DOUBT_SHOWN
+
+ROOT = Path(__file__).resolve().parents[1]
+ROLES = ("right", "front", "left")
+#: Pairs of them whose angle counts.
+PAIRS = ((0, 1), (1, 2))
+SIZE = (1024, 768)
+#: A crown whose outline holds less of any tooth than this is none.
+LEAST_COVERED = 0.3
+
+
+def make_photographs(folder: Path, seed: int) -> None:
+    """Three photographs of a mouth, labels beside them, cameras in `truth.json`; once."""
+    if (folder / "truth.json").exists():
+        return
+    sys.path.insert(0, str(ROOT / "data_samples"))
+    from mouths.mouth import random_mouth
+    from mouths.photo import photograph
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng([5, seed])
+    mouth = random_mouth(rng)
+    poses = []
+    for stem in ROLES:
+        photo = photograph(mouth, rng, stem, bite="closed", width=SIZE[0], height=SIZE[1])
+        cv2.imwrite(str(folder / f"{stem}.jpg"), photo.image[..., ::-1])
+        cv2.imwrite(str(folder / f"{stem}.png"), photo.labels)
+        poses.append(photo.camera.cam_from_world.tolist())
+    truth = {"dentition": mouth.options.dentition, "poses": poses}
+    (folder / "truth.json").write_text(json.dumps(truth))
+
+
+def numbers(outcome: Outcome, folder: Path, names: dict[str, str]) -> dict[str, int]:
+    """Crowns whose number is right, wrong, and wrong but marked as doubtful."""
+    found = {"right": 0, "wrong": 0, "marked": 0}
+    for seen in outcome.teeth.views if outcome.teeth else ():
+        path = folder / f"{names[seen.name]}.png"
+        truth = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        labels = cv2.resize(truth, seen.size, interpolation=cv2.INTER_NEAREST)
+        for crown in seen.all_crowns:
+            inside = np.zeros(labels.shape, np.uint8)
+            cv2.fillPoly(inside, [np.round(crown.outline).astype(np.int32)], 1)
+            covered = labels[(inside > 0) & (labels > 0)]
+            if not crown.number or len(covered) < LEAST_COVERED * inside.sum():
+                continue
+            right = int(np.bincount(covered).argmax()) == crown.number
+            found["right" if right else "wrong"] += 1
+            found["marked"] += not right and crown.doubt > DOUBT_SHOWN
+    return found
+
+
+def run_mouth(seed: int, out: Path) -> dict[str, Any]:
+    """One mouth: what the fit made of it, against the truth."""
+    cv2.setNumThreads(1)
+    folder = out / f"mouth_{seed:04d}"
+    make_photographs(folder, seed)
+    truth = json.loads((folder / "truth.json").read_text())
+    photos = tuple(Photo(folder.name, folder / f"{stem}.jpg", stem) for stem in ROLES)
+    outcome = Runner(out / "readings", 1, {"method": "dental"}).run(Item(folder.name, CASE, photos))
+    names = {v.name: Path(v.source_name).stem for v in outcome.views.views}
+    row: dict[str, Any] = {
+        "seed": seed, "dentition": truth["dentition"], "accepted": outcome.accepted,
+        "doubts": list(outcome.fit.doubts) if outcome.fit else [outcome.message],
+        "off": [], "believed": [], **numbers(outcome, folder, names),
+    }  # fmt: skip
+    placed = {
+        names[name]: view.cam_from_world[:3, :3]
+        for name, view in zip(
+            outcome.fitted, outcome.fit.views if outcome.fit else (), strict=False
+        )
+        if view is not None
+    }
+    if outcome.fit is None or len(placed) < len(ROLES):
+        return row
+    order = [names[name] for name in outcome.fitted]
+    true = {s: np.array(p)[:3, :3] for s, p in zip(ROLES, truth["poses"], strict=True)}
+    for a, b in PAIRS:
+        one, two = ROLES[a], ROLES[b]
+        turn, found = true[two] @ true[one].T, placed[two] @ placed[one].T
+        row["off"].append(angle_between(turn, found))
+        i, j = sorted((order.index(one), order.index(two)))
+        row["believed"].append(outcome.fit.figures.get(f"angle_deviation_{i}_{j}", np.nan))
+    return row
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """A line for grown-ups' mouths, and one for children's."""
+    lines = []
+    for name, mine in (
+        ("permanent", [r for r in rows if r["dentition"] == "permanent"]),
+        ("primary, mixed", [r for r in rows if r["dentition"] != "permanent"]),
+    ):
+        if not mine:
+            continue
+        right, wrong, marked = (sum(r[k] for r in mine) for k in ("right", "wrong", "marked"))
+        off = np.array([angle for r in mine for angle in r["off"]])
+        believed = np.array([angle for r in mine for angle in r["believed"]])
+        angles = "no angles"
+        if len(off):
+            half, most = np.quantile(off, (0.5, 0.9))
+            angles = (
+                f"{len(off)} angles off by {half:.1f} (90 %: {most:.1f}) degrees, believed to be "
+                f"known to {np.nanmedian(believed):.1f}"
+            )
+        lines.append(
+            f"{name}: {len(mine)} mouths, {sum(r['accepted'] for r in mine)} scenes; numbers "
+            f"{right} right, {wrong} wrong ({marked} marked); {angles}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=0, help="mouths")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="folder that is kept")
+    options = parser.parse_args()
+    if not options.count:
+        print("Nothing to do without --count.")
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        out = options.out or Path(scratch)
+        seeds = range(options.first, options.first + options.count)
+        rows = []
+        with ProcessPoolExecutor(options.jobs, mp_context=get_context("forkserver")) as pool:
+            for row in pool.map(partial(run_mouth, out=out), seeds):
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+        print(summary(rows))
+        if options.out:
+            (out / "mouths.json").write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
