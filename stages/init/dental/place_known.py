@@ -27,6 +27,7 @@ from stages.init.dental.place import (
     arch_options,
     masked,
     neighbours,
+    numbered_otherwise,
     surface_options,
     tooth_counts,
 )
@@ -133,7 +134,7 @@ def from_known_teeth(
         raise ReconstructionError(
             f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
         )
-    for doubt in teeth.fit.doubts:
+    for doubt in (*teeth.fit.doubts, *numbered_otherwise(teeth, config.dental.min_margin)):
         context.warn(doubt)
     left_out = [photo_name(view) for view in views.views if view.name not in known]
     if left_out:

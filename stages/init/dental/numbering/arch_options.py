@@ -77,7 +77,7 @@ class ArchOptions:
     any_light_cost: float = 5.0
     #: Median landmark error above which the fit is doubted. This limit, the next one, that of
     #: epipolar errors and `confidence.EDGE` lie a third above the most that twelve patients came
-    #: to, each also altered in seven ways. None of 187 mixes of two patients, nor of 69 with
+    #: to, each also altered in seven ways. None of 187 mixes of two patients, nor of 57 with
     #: mirror images or open jaws, was refused for one of the four alone.
     max_error: float = 0.055
     #: Standard deviation of the angle between neighbouring views above which it is doubted. It says
