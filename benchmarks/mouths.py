@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -23,29 +22,25 @@ from typing import Any
 
 import cv2
 import numpy as np
+from films import truths
 from triads_data import CASE, Item, Photo
 from triads_run import Outcome, Runner
 
+from data_samples.mouths.mouth import random_mouth
+from data_samples.mouths.photo import photograph
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.overlay import DOUBT_SHOWN
 
-ROOT = Path(__file__).resolve().parents[1]
 ROLES = ("right", "front", "left")
 #: Pairs of them whose angle counts.
 PAIRS = ((0, 1), (1, 2))
 SIZE = (1024, 768)
-#: A crown whose outline holds less of any tooth than this is none.
-LEAST_COVERED = 0.3
 
 
 def make_photographs(folder: Path, seed: int) -> None:
     """Three photographs of a mouth, labels beside them, cameras in `truth.json`; once."""
     if (folder / "truth.json").exists():
         return
-    sys.path.insert(0, str(ROOT / "data_samples"))
-    from mouths.mouth import random_mouth
-    from mouths.photo import photograph
-
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([5, seed])
     mouth = random_mouth(rng)
@@ -63,18 +58,12 @@ def numbers(outcome: Outcome, folder: Path, names: dict[str, str]) -> dict[str, 
     """Crowns whose number is right, wrong, and wrong but marked as doubtful."""
     found = {"right": 0, "wrong": 0, "marked": 0}
     for seen in outcome.teeth.views if outcome.teeth else ():
-        path = folder / f"{names[seen.name]}.png"
-        truth = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
-        labels = cv2.resize(truth, seen.size, interpolation=cv2.INTER_NEAREST)
-        for crown in seen.all_crowns:
-            inside = np.zeros(labels.shape, np.uint8)
-            cv2.fillPoly(inside, [np.round(crown.outline).astype(np.int32)], 1)
-            covered = labels[(inside > 0) & (labels > 0)]
-            if not crown.number or len(covered) < LEAST_COVERED * inside.sum():
-                continue
-            right = int(np.bincount(covered).argmax()) == crown.number
-            found["right" if right else "wrong"] += 1
-            found["marked"] += not right and crown.doubt > DOUBT_SHOWN
+        true = truths(seen, folder / f"{names[seen.name]}.png")
+        for crown, number in zip(seen.all_crowns, true, strict=True):
+            if crown.number and number:
+                right = number == crown.number
+                found["right" if right else "wrong"] += 1
+                found["marked"] += not right and crown.doubt > DOUBT_SHOWN
     return found
 
 
@@ -92,14 +81,14 @@ def run_mouth(seed: int, out: Path) -> dict[str, Any]:
         "doubts": list(outcome.fit.doubts) if outcome.fit else [outcome.message],
         "off": [], "believed": [], **numbers(outcome, folder, names),
     }  # fmt: skip
+    if outcome.fit is None:
+        return row
     placed = {
         names[name]: view.cam_from_world[:3, :3]
-        for name, view in zip(
-            outcome.fitted, outcome.fit.views if outcome.fit else (), strict=False
-        )
+        for name, view in zip(outcome.fitted, outcome.fit.views, strict=True)
         if view is not None
     }
-    if outcome.fit is None or len(placed) < len(ROLES):
+    if len(placed) < len(ROLES):
         return row
     order = [names[name] for name in outcome.fitted]
     true = {s: np.array(p)[:3, :3] for s, p in zip(ROLES, truth["poses"], strict=True)}

@@ -6,6 +6,7 @@ import math
 from types import SimpleNamespace
 from typing import Any, cast
 
+from stages.dentition.overlay import DOUBT_SHOWN
 from stages.init.dental.numbering.edits import shifted_labellings
 from stages.init.dental.numbering.hypotheses import Labelling, Scored
 from stages.init.dental.numbering.rivals import (
@@ -79,6 +80,7 @@ def test_numbers_that_a_near_rival_has_otherwise_are_marked() -> None:
     best, rival = scored(0, RIGHT, FRONT, LEFT), scored(5.5, GAP, FRONT, LEFT)
     (upper, lower), front, left = label_doubts(best, [rival], least_margin=6.0)
     assert upper[:4] == (NEAR_DOUBT,) * 4
+    assert NEAR_DOUBT > DOUBT_SHOWN
     assert {*upper[4:], *lower, *front[0], *left[0]} == {LEAST_DOUBT}
     far = label_doubts(best, [rival], least_margin=5.0)
     assert LEAST_DOUBT < far[0][0][0] < 0.1

@@ -53,7 +53,8 @@ class ArchFit:
         views: one per photograph, in the order given; None where it could not be placed.
         landmarks: seen landmarks -> [3] position in mm (arch frame).
         shape: every landmark of the arch model, seen or not -> [3] position in mm, after fitting.
-        margin: by how much the labelling chosen is better than the next one (log evidence).
+        margin: by how much the labelling chosen is better than the next one that matches the
+            photographs to each other otherwise (twice the log evidence).
         doubts: sentences for the user why the result should not be trusted; empty: trust it.
         scale_uncertainty: relative standard deviation of the millimetres.
         figures: what the doubts rest on.

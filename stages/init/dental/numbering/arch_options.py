@@ -75,10 +75,10 @@ class ArchOptions:
     any_light_match_weight: float = 3.0
     usual_share: float = 0.008
     any_light_cost: float = 5.0
-    #: Median landmark error above which the fit is doubted. This limit, the next one, that of
-    #: epipolar errors and `confidence.EDGE` lie a third above the most that twelve patients came
-    #: to, each also altered in seven ways. None of 187 mixes of two patients, nor of 57 with
-    #: mirror images or open jaws, was refused for one of the four alone.
+    #: Median landmark error above which the fit is doubted. This limit, that of epipolar
+    #: errors and `confidence.EDGE` lie a third above the most that twelve patients came to, each
+    #: also altered in seven ways; the next one a sixth. None of 136 mixes of two patients, nor of
+    #: 57 with mirror images or open jaws, was refused for one of the four alone.
     max_error: float = 0.055
     #: Standard deviation of the angle between neighbouring views above which it is doubted. It says
     #: how far photographs of one mouth, altered, move it: by .9 of it, 3 degrees (root mean square

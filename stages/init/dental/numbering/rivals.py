@@ -86,8 +86,8 @@ def label_doubts(
 ) -> list[tuple[Doubts, Doubts]]:
     """Probability, view by view and row by row, that each crown's label is another one.
 
-    Every labelling that was solved counts by its evidence; of equal ones the best counts. What one
-    of `Margins.numbers` within the least margin calls otherwise has `NEAR_DOUBT` at least.
+    Every labelling that was solved counts by its evidence; of equal ones the best counts. Where one
+    within the least margin renames several crowns, these have `NEAR_DOUBT` at least.
 
     Args:
         best: the labelling chosen.
