@@ -4,9 +4,10 @@
 
 Every photograph has a lens, a distance, a crop and a light of its own, so that most are refused for
 their colours: numbers and angles are those of the fit, whatever becomes of it. Angles are between
-the photograph from the front and those from the sides, after the fit's own roll; what the fit
-believes is the standard deviation that it gives itself. OUT keeps photographs and readings, which
-makes the next run quicker.
+the photograph from the front and those from the sides; a true camera whose principal point is not
+in the middle of its photograph counts as turned to what is. What the fit believes is the standard
+deviation that it gives itself. OUT keeps photographs and readings, which makes the next run
+quicker.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from films import truths
+from scipy.spatial.transform import Rotation
 from triads_data import CASE, Item, Photo
 from triads_run import Outcome, Runner
 
@@ -31,6 +34,7 @@ from data_samples.mouths.photo import photograph
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.overlay import DOUBT_SHOWN
 
+Floats = npt.NDArray[np.float64]
 ROLES = ("right", "front", "left")
 #: Pairs of them whose angle counts.
 PAIRS = ((0, 1), (1, 2))
@@ -44,14 +48,29 @@ def make_photographs(folder: Path, seed: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([5, seed])
     mouth = random_mouth(rng)
-    poses = []
+    cameras = []
     for stem in ROLES:
         photo = photograph(mouth, rng, stem, bite="closed", width=SIZE[0], height=SIZE[1])
         cv2.imwrite(str(folder / f"{stem}.jpg"), photo.image[..., ::-1])
         cv2.imwrite(str(folder / f"{stem}.png"), photo.labels)
-        poses.append(photo.camera.cam_from_world.tolist())
-    truth = {"dentition": mouth.options.dentition, "poses": poses}
+        camera = photo.camera
+        cameras.append(
+            {
+                "cam_from_world": camera.cam_from_world.tolist(), "focal": camera.fx,
+                "middle": [camera.cx, camera.cy],
+            }
+        )  # fmt: skip
+    truth = {"dentition": mouth.options.dentition, "cameras": cameras}
     (folder / "truth.json").write_text(json.dumps(truth))
+
+
+def turned_to_middle(camera: dict[str, Any]) -> Floats:
+    """[3, 3] camera from world of a camera of `truth.json`, turned so that its axis goes through
+    the middle of the photograph."""
+    x, y = np.array(camera["middle"]) - np.array(SIZE) / 2
+    axis = np.array([-x, -y, camera["focal"]])
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [axis / np.linalg.norm(axis)])[0]
+    return np.asarray(turn.as_matrix() @ np.array(camera["cam_from_world"])[:3, :3])
 
 
 def numbers(outcome: Outcome, folder: Path, names: dict[str, str]) -> dict[str, int]:
@@ -91,7 +110,7 @@ def run_mouth(seed: int, out: Path) -> dict[str, Any]:
     if len(placed) < len(ROLES):
         return row
     order = [names[name] for name in outcome.fitted]
-    true = {s: np.array(p)[:3, :3] for s, p in zip(ROLES, truth["poses"], strict=True)}
+    true = {s: turned_to_middle(c) for s, c in zip(ROLES, truth["cameras"], strict=True)}
     for a, b in PAIRS:
         one, two = ROLES[a], ROLES[b]
         turn, found = true[two] @ true[one].T, placed[two] @ placed[one].T

@@ -70,7 +70,7 @@ def evidence(one_light: float, any_light: float, common: float, share: float) ->
         (5.0, 1.0, 40.0, 0.03, True),  # another light, all else agrees
         (5.0, 1.0, 40.0, 0.0, False),  # ... but nothing matches
         (5.0, 4.0, 40.0, 0.03, False),  # ... but gum and enamel differ
-        (5.0, 1.0, -40.0, 0.03, False),  # ... but the teeth stand elsewhere
+        (5.0, 1.0, -60.0, 0.03, False),  # ... but the teeth stand elsewhere
     ],
 )
 def test_what_colours_no_longer_say_the_rest_must_make_good(

@@ -5,7 +5,9 @@ whitened problem and its determinant compares hypotheses:
 - per view seven: rotation vector (tilt, yaw, roll about the camera's axes, applied after the
   nominal rotation), place of the arch's centre in the camera frame, log focal length;
 - nine of the arch: stretch along x, y, z; shift and extra stretch of the lower jaw;
-- three per landmark: its own offset. These are eliminated (Schur complement).
+- three per landmark: its own offset. These are eliminated (Schur complement). They are stretched
+  with the arch: in true millimetres, offsets would be the cheaper the smaller the arch, and all
+  patients come out a seventh too small.
 
 Minimised is twice the negative log posterior by Levenberg-Marquardt with reweighting (pseudo-Huber
 on landmarks, Cauchy on dense matches).
@@ -186,10 +188,9 @@ def shaped_points(
     """[L, 3] landmarks in mm for `unknowns` [.. + 9] and `offsets` [L, 3]."""
     g = unknowns[-kernels.PER_ARCH :]
     lower = is_lower_landmark()[:, None]
-    points = template * (1 + kernels.STRETCH * g[:3]) + landmark_deviation * offsets
-    return np.asarray(
-        points + lower * (kernels.LOWER_SHIFT * g[3:6] + kernels.LOWER_STRETCH * template * g[6:9])
-    )
+    stretch = 1 + kernels.STRETCH * g[:3] + lower * kernels.LOWER_STRETCH * g[6:9]
+    own = template + landmark_deviation * offsets
+    return np.asarray(stretch * own + lower * kernels.LOWER_SHIFT * g[3:6])
 
 
 def adjust(
@@ -209,7 +210,8 @@ def adjust(
         sightings: what was seen of which landmark.
         template: [L, 3] the textbook arch, mm.
         priors: of the cameras.
-        landmark_deviation: mm by which a landmark lies off the stretched textbook arch.
+        landmark_deviation: mm by which a landmark lies off the textbook arch, before it is
+            stretched.
         matches: dense matches, where there are any.
         start: unknowns [7V + 9] and offsets [L, 3] to start from; None: from the priors.
         max_steps: Levenberg-Marquardt steps at most.

@@ -70,17 +70,20 @@ def add_landmarks(  # type: ignore[no-untyped-def]
     row = np.zeros((2, PER_VIEW + PER_ARCH))
     own = np.zeros((2, 3))
     columns = np.empty(PER_VIEW + PER_ARCH, np.int64)
-    X = np.empty(3)
+    X, own_place, stretch = np.empty(3), np.empty(3), np.empty(3)
     turned = np.empty(3)
     knee = LANDMARK_KNEE
     for o in range(len(view_of)):
         v, i = view_of[o], landmark_of[o]
         R = rotations[v]
         for a in range(3):
-            t = template[i, a]
-            X[a] = t * (1 + STRETCH * x[arch + a]) + offset_deviation * offsets[i, a]
+            own_place[a] = template[i, a] + offset_deviation * offsets[i, a]
+            stretch[a] = 1 + STRETCH * x[arch + a]
             if lower[i]:
-                X[a] += LOWER_SHIFT * x[arch + 3 + a] + LOWER_STRETCH * t * x[arch + 6 + a]
+                stretch[a] += LOWER_STRETCH * x[arch + 6 + a]
+            X[a] = stretch[a] * own_place[a]
+            if lower[i]:
+                X[a] += LOWER_SHIFT * x[arch + 3 + a]
         z0 = X[2] - CENTRE_Z
         for a in range(3):
             turned[a] = R[a, 0] * X[0] + R[a, 1] * X[1] + R[a, 2] * z0
@@ -111,11 +114,11 @@ def add_landmarks(  # type: ignore[no-untyped-def]
             row[r, 6] = (px if r == 0 else py) * scale * focal_deviations[v]
             for a in range(3):
                 d_world = g0 * R[0, a] + g1 * R[1, a] + g2 * R[2, a]
-                t = template[i, a]
+                t = own_place[a]
                 row[r, 7 + a] = d_world * t * STRETCH
                 row[r, 10 + a] = d_world * LOWER_SHIFT if lower[i] else 0.0
                 row[r, 13 + a] = d_world * t * LOWER_STRETCH if lower[i] else 0.0
-                own[r, a] = d_world * offset_deviation
+                own[r, a] = d_world * stretch[a] * offset_deviation
         for k in range(PER_VIEW):
             columns[k] = PER_VIEW * v + k
         for k in range(PER_ARCH):

@@ -69,11 +69,9 @@ EDITED, EDIT_WINDOW = 3, 40.0
 SHIFTS, EDIT_GAP = 3, 30.0
 #: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
 MATCHED_YAW = 32.0
-#: Shapes of photographs as cameras take them (long over short side), told apart to this share.
-SENSOR_SHAPES, SHAPE_TOLERANCE = (4 / 3, 3 / 2, 16 / 9), 0.01
 #: How far away known cameras are, they say themselves: hardly any prior (relative deviation).
 HELD_DISTANCE_DEVIATION = 0.5
-#: The millimetres rest on the focal length or distance expected: relative standard deviation.
+#: The millimetres rest on the size of a textbook arch: relative standard deviation.
 SCALE_UNCERTAINTY = 0.15
 
 
@@ -221,24 +219,11 @@ def _focal_priors(
 ) -> tuple[Array, Array]:
     """Focal lengths in pixels and their relative standard deviations (0 where known)."""
     values, deviations = [], []
-    cropped = looks_cropped([dentition.size for dentition in dentitions])
-    unknown = options.cropped_focal_deviation if cropped else options.focal_deviation
     for focal, dentition in zip(focals, dentitions, strict=True):
         # Of the long side: turning the camera upright does not change its lens.
         values.append(focal or options.focal_per_side * max(dentition.size))
-        deviations.append(0.0 if focal else unknown)
+        deviations.append(0.0 if focal else options.focal_deviation)
     return np.array(values, np.float64), np.array(deviations, np.float64)
-
-
-def looks_cropped(sizes: list[tuple[int, int]]) -> bool:
-    """Were some of these photographs cut by hand? Whole ones have a sensor's shape, all the same.
-
-    Args:
-        sizes: width and height of each.
-    """
-    ratios = [max(size) / min(size) for size in sizes]
-    whole = any(abs(ratios[0] / shape - 1) < SHAPE_TOLERANCE for shape in SENSOR_SHAPES)
-    return not whole or max(ratios) / min(ratios) > 1 + SHAPE_TOLERANCE
 
 
 def _label(scorer: Scorer, fixed: Fixed, progress: Progress) -> tuple[Scored, list[Scored]]:
@@ -356,7 +341,12 @@ def _refine(
     options: ArchOptions,
     progress: Progress,
 ) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
-    """Rounds of dense matches on the unrolled arch and bundle adjustment."""
+    """The cameras of a numbering: rounds of dense matches on the unrolled arch and bundle
+    adjustment."""
+    offsets = best.adjusted.offsets * (options.numbering_deviation / options.landmark_deviation)
+    best = scorer.solve(
+        best.labelling, (best.adjusted.unknowns, offsets), deviation=options.landmark_deviation
+    )
     photos = in_threads(
         lambda photo: prepare_photo(
             photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
@@ -382,7 +372,9 @@ def _refine(
         )
         if not scorer.held:
             start = (best.adjusted.unknowns, best.adjusted.offsets)
-            best = scorer.solve(best.labelling, start, matches=matches)
+            best = scorer.solve(
+                best.labelling, start, matches=matches, deviation=options.landmark_deviation
+            )
     progress("dense matches on the arch", rounds, rounds)
     return best, pairs
 

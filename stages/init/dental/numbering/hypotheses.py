@@ -217,13 +217,23 @@ class Scorer:
         start: tuple[Array, Array] | None = None,
         max_steps: int = FINAL_STEPS,
         matches: Matches = NO_MATCHES,
+        deviation: float | None = None,
     ) -> Scored:
-        """Solve and score one labelling."""
+        """Solve and score one labelling.
+
+        Args:
+            labelling: the hypothesis.
+            start: unknowns and offsets to start from.
+            max_steps: of the solver.
+            matches: dense ones, where there are any.
+            deviation: of landmarks from the textbook arch, mm; None: that of numberings. Scores
+                with different ones don't compare.
+        """
         adjusted = adjust(
             self.cache.collect(list(labelling.views), list(labelling.labels)),
             textbook_arch(labelling.closed, labelling.primary),
             self.priors(labelling.views, labelling.roles),
-            self.options.landmark_deviation,
+            deviation or self.options.numbering_deviation,
             matches=matches,
             start=start,
             max_steps=max_steps,
