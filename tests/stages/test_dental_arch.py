@@ -108,7 +108,9 @@ def test_gradients_agree_with_finite_differences() -> None:
             x, views, nominal, angles, 125.0, focals, focal_deviations, rotations, centres, lens,
             jacobians,
         )  # fmt: skip
-        cost = kernels.add_priors(x, offsets, views, 125.0, 0.15, centres, True, H, b, H_own, b_own)
+        cost = kernels.add_priors(
+            x, offsets, views, 125.0, 0.3, 0.1, centres, True, H, b, H_own, b_own
+        )
         cost += kernels.add_landmarks(
             x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower, 1.2,
             rotations, centres, lens, jacobians, angles, focal_deviations, True,

@@ -13,6 +13,9 @@ PER_VIEW, PER_ARCH = 7, 9
 STRETCH, LOWER_SHIFT, LOWER_STRETCH = 0.10, 1.5, 0.07
 #: The centre of the arch lies in the camera frame within a few of these (mm): nearly free.
 CENTRE_UNIT = 10.0
+#: A photographer keeps a distance: relative standard deviation of that of a photograph from those
+#: of the others.
+OWN_DISTANCE = 0.1
 #: Residuals beyond these many standard deviations count less (landmarks: pseudo-Huber, dense
 #: matches: Cauchy).
 LANDMARK_KNEE, DENSE_KNEE = 2.0, 1.5
@@ -250,14 +253,19 @@ def add_matches(  # type: ignore[no-untyped-def]
 
 
 @kernel(
-    "float64(float64[::1], float64[:,::1], int64, float64, float64, float64[:,::1], boolean,"
-    " float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1])",
+    "float64(float64[::1], float64[:,::1], int64, float64, float64, float64, float64[:,::1],"
+    " boolean, float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1])",
     nogil=True,
 )
 def add_priors(  # type: ignore[no-untyped-def]
-    x, offsets, views, distance, distance_deviation, centres, derive, H, b, H_own, b_own
-):
-    """Cost of the priors: unit variance but for the arch's centre, of which only depth has one."""
+    x, offsets, views, distance, distance_deviation, own_deviation, centres, derive, H, b,
+    H_own, b_own,
+):  # fmt: skip
+    """Cost of the priors: unit variance but for the arch's centre, of which only depth has one.
+
+    The logarithms of the depths vary together (distance_deviation) and each by itself
+    (own_deviation): their precision is I / own^2 less `shared` everywhere (Sherman and Morrison).
+    """
     cost = 0.0
     for k in range(len(x)):
         within = k % PER_VIEW
@@ -267,15 +275,25 @@ def add_priors(  # type: ignore[no-untyped-def]
         if derive:
             b[k] += x[k]
             H[k, k] += 1
+    precision = 1 / own_deviation**2
+    common = (distance_deviation * precision) ** 2
+    shared = common / (1 + views * distance_deviation**2 * precision)
+    total = 0.0
     for v in range(views):
-        depth = max(centres[v, 2], 20.0)
-        r = np.log(depth / distance) / distance_deviation
-        cost += r * r
+        r = np.log(max(centres[v, 2], 20.0) / distance)
+        total += r
+        cost += precision * r * r
+    cost -= shared * total * total
+    for v in range(views):
         if derive:
-            slope = CENTRE_UNIT / (depth * distance_deviation)
+            depth = max(centres[v, 2], 20.0)
+            slope = CENTRE_UNIT / depth
             k = PER_VIEW * v + 5
-            b[k] += slope * r
-            H[k, k] += slope * slope
+            b[k] += slope * (precision * np.log(depth / distance) - shared * total)
+            H[k, k] += slope * slope * precision
+            for w in range(views):
+                other = CENTRE_UNIT / max(centres[w, 2], 20.0)
+                H[k, PER_VIEW * w + 5] -= slope * other * shared
             # A trace of a prior sideways keeps the equations regular where a view has no landmarks.
             H[k - 1, k - 1] += 1e-6
             H[k - 2, k - 2] += 1e-6

@@ -18,6 +18,7 @@ from stages.init.dental.cameras.algebra import (
 from stages.init.dental.cameras.held import PER_SIMILARITY, tangents, unknowns_of
 from stages.init.dental.cameras.kernels import (
     CENTRE_UNIT,
+    OWN_DISTANCE,
     PER_ARCH,
     PER_VIEW,
     add_landmarks,
@@ -30,8 +31,8 @@ from stages.init.dental.cameras.kernels import (
 @helper
 def _assess(  # type: ignore[no-untyped-def]
     x, offsets, view_of, landmark_of, pixels, deviations, template, lower, offset_deviation,
-    nominal, angle_deviations, distance, distance_deviation, focals, focal_deviations,
-    pairs, starts, matches, pair_weights, pair_deviations,
+    nominal, angle_deviations, distance, distance_deviation, own_deviation, focals,
+    focal_deviations, pairs, starts, matches, pair_weights, pair_deviations,
     rotations, centres, lens, jacobians, derive, H, b, H_own, b_own, H_cross,
 ):  # fmt: skip
     """Cost at x and offsets; where `derive`, with the normal equations."""
@@ -43,7 +44,18 @@ def _assess(  # type: ignore[no-untyped-def]
         rotations, centres, lens, jacobians,
     )  # fmt: skip
     cost = add_priors(
-        x, offsets, views, distance, distance_deviation, centres, derive, H, b, H_own, b_own
+        x,
+        offsets,
+        views,
+        distance,
+        distance_deviation,
+        own_deviation,
+        centres,
+        derive,
+        H,
+        b,
+        H_own,
+        b_own,
     )
     cost += add_landmarks(
         x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
@@ -82,6 +94,8 @@ def minimise(  # type: ignore[no-untyped-def]
         or [16, 16] of similarity and arch.
     """
     views, n, count = len(nominal), len(x), len(offsets)
+    # How far known cameras are from each other, they say themselves.
+    own_deviation = distance_deviation if held else OWN_DISTANCE
     m = PER_SIMILARITY + PER_ARCH if held else n
     rotations, jacobians = np.empty((views, 3, 3)), np.empty((views, 3, 3))
     centres, lens = np.empty((views, 3)), np.empty(views)
@@ -102,8 +116,9 @@ def minimise(  # type: ignore[no-untyped-def]
     for iteration in range(max_steps + 1):
         cost = _assess(
             x, offsets, view_of, landmark_of, pixels, deviations, template, lower,
-            offset_deviation, nominal, angle_deviations, distance, distance_deviation, focals,
-            focal_deviations, pairs, starts, matches, pair_weights, pair_deviations,
+            offset_deviation, nominal, angle_deviations, distance, distance_deviation,
+            own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
+            pair_deviations,
             rotations, centres, lens, jacobians, True, H, b, H_own, b_own, H_cross,
         )  # fmt: skip
         if held:
@@ -150,8 +165,9 @@ def minimise(  # type: ignore[no-untyped-def]
                     trial[k] = x[k] - step[k]
             new_cost = _assess(
                 trial, trial_offsets, view_of, landmark_of, pixels, deviations, template, lower,
-                offset_deviation, nominal, angle_deviations, distance, distance_deviation, focals,
-                focal_deviations, pairs, starts, matches, pair_weights, pair_deviations,
+                offset_deviation, nominal, angle_deviations, distance, distance_deviation,
+                own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
+            pair_deviations,
                 rotations, centres, lens, jacobians, False, H, b, H_own, b_own, H_cross,
             )  # fmt: skip
             if new_cost < cost:
