@@ -103,9 +103,6 @@ def changing(seed: int) -> tuple[Case, tuple[Dentition, ...], ArchFit]:
     return photographed, tuple(dentitions), fitted(photographed, dentitions)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="53, seen from the left through a gap amid the row, is named 54"
-)
 def test_places_of_changing_teeth() -> None:
     photographed, dentitions, fit = changing(15)
     for photo, dentition in zip(photographed.photos, named(list(dentitions), fit), strict=True):
