@@ -44,19 +44,9 @@ def _assess(  # type: ignore[no-untyped-def]
         rotations, centres, lens, jacobians,
     )  # fmt: skip
     cost = add_priors(
-        x,
-        offsets,
-        views,
-        distance,
-        distance_deviation,
-        own_deviation,
-        centres,
-        derive,
-        H,
-        b,
-        H_own,
-        b_own,
-    )
+        x, offsets, views, distance, distance_deviation, own_deviation, centres, derive, H, b,
+        H_own, b_own,
+    )  # fmt: skip
     cost += add_landmarks(
         x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower,
         offset_deviation, rotations, centres, lens, jacobians, angle_deviations,
@@ -118,8 +108,7 @@ def minimise(  # type: ignore[no-untyped-def]
             x, offsets, view_of, landmark_of, pixels, deviations, template, lower,
             offset_deviation, nominal, angle_deviations, distance, distance_deviation,
             own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
-            pair_deviations,
-            rotations, centres, lens, jacobians, True, H, b, H_own, b_own, H_cross,
+            pair_deviations, rotations, centres, lens, jacobians, True, H, b, H_own, b_own, H_cross,
         )  # fmt: skip
         if held:
             tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
@@ -167,8 +156,8 @@ def minimise(  # type: ignore[no-untyped-def]
                 trial, trial_offsets, view_of, landmark_of, pixels, deviations, template, lower,
                 offset_deviation, nominal, angle_deviations, distance, distance_deviation,
                 own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
-            pair_deviations,
-                rotations, centres, lens, jacobians, False, H, b, H_own, b_own, H_cross,
+                pair_deviations, rotations, centres, lens, jacobians, False, H, b, H_own, b_own,
+                H_cross,
             )  # fmt: skip
             if new_cost < cost:
                 improved = True
