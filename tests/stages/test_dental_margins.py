@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
+
+import pytest
 
 from stages.dentition.overlay import DOUBT_SHOWN
 from stages.init.dental.numbering.edits import shifted_labellings
@@ -12,8 +15,10 @@ from stages.init.dental.numbering.hypotheses import Labelling, Scored
 from stages.init.dental.numbering.rivals import (
     LEAST_DOUBT,
     NEAR_DOUBT,
+    PICTURED_WINDOW,
     Margins,
     differences,
+    judged_by_pictures,
     label_doubts,
     margins,
 )
@@ -29,9 +34,17 @@ GAP = ((-1, 0, 1, 2, 4, 5, 6, 7), RIGHT[1])
 MOVED = ((7, 8, 9, 10, 11, 12, 13, -1), LEFT[1])
 
 
+@dataclass(frozen=True)
+class Unsolved:
+    """A labelling with a score and no cameras."""
+
+    labelling: Labelling
+    score: float
+
+
 def scored(score: float, *labels: Any) -> Scored:
     labelling = Labelling(views=(0, 1, 2), roles=("right", "frontal", "left"), labels=labels)
-    return cast(Scored, SimpleNamespace(labelling=labelling, score=score))
+    return cast(Scored, Unsolved(labelling, score))
 
 
 def test_what_one_photograph_alone_shows_ties_nothing() -> None:
@@ -74,6 +87,54 @@ def test_margins_are_told_apart() -> None:
     ]  # fmt: skip
     assert margins(best, others) == Margins(cameras=20, numbers=5, local=2)
     assert margins(best, [best]) == Margins(math.inf, math.inf, math.inf)
+
+
+#: Shares of the pairs that match where crowns are laid over themselves, and where one photograph is
+#: a tooth off.
+IN_PLACE, OFF = {(0, 1): 0.02, (1, 2): 0.04}, {(0, 1): 0.02, (1, 2): 0.005}
+
+
+def test_pictures_of_other_teeth_speak_against_a_shifted_row() -> None:
+    best, moved = scored(0, RIGHT, FRONT, LEFT), scored(5, RIGHT, FRONT, (MOVED[0], MOVED[0]))
+    # a rival like it but for an end of the row has its pictures; one that is far off is not asked
+    like = scored(7, RIGHT, FRONT, (MOVED[0], (*MOVED[0][:-2], -1, -1)))
+    far = scored(PICTURED_WINDOW + 1, RIGHT, FRONT, MOVED)
+    asked = []
+
+    def shares(labelling: Scored) -> dict[tuple[int, int], float]:
+        asked.append(labelling)
+        return IN_PLACE if labelling is best else OFF
+
+    winner, (first, second, third) = judged_by_pictures(best, [moved, like, far], shares)
+    assert winner is best
+    assert asked == [best, moved]
+    assert first.score == pytest.approx(5 + 4.7 * math.log(0.042 / 0.007))
+    assert second.score - like.score == first.score - moved.score
+    assert third == far
+
+
+def test_pictures_choose_between_near_labellings() -> None:
+    best, moved = scored(0, RIGHT, FRONT, (MOVED[0], MOVED[0])), scored(5, RIGHT, FRONT, LEFT)
+    winner, others = judged_by_pictures(best, [moved], lambda s: OFF if s is best else IN_PLACE)
+    assert winner.labelling == moved.labelling
+    assert winner.score < 0
+    assert others == [best]
+
+
+def test_pictures_say_nothing_where_all_photographs_are_renamed_alike() -> None:
+    """The same crowns lie over each other, whatever they are called."""
+    best = scored(0, RIGHT, FRONT, LEFT)
+    back = [tuple(tuple(k - 1 for k in row) for row in view) for view in (FRONT, LEFT)]
+    renamed = scored(3, RIGHT, *back)
+    winner, (other,) = judged_by_pictures(
+        best, [renamed], lambda s: {(0, 1): 0.02, (1, 2): 0.04 if s is best else 0.001}
+    )
+    assert (winner, other) == (best, renamed)
+
+
+def test_nobody_is_asked_where_no_rival_is_near() -> None:
+    best, gap = scored(0, RIGHT, FRONT, LEFT), scored(3, GAP, FRONT, LEFT)
+    assert judged_by_pictures(best, [gap], lambda s: pytest.fail("asked")) == (best, [gap])
 
 
 def test_numbers_that_a_near_rival_has_otherwise_are_marked() -> None:

@@ -1,8 +1,9 @@
 """Which tooth is which and where the cameras are, from the crowns in a few wide photographs.
 
 The teeth are the landmarks, a textbook arch is the prior: labellings are compared by evidence
-(`hypotheses`, `edits`), the best one is refined with dense matches on the unrolled arch
-(`unrolled`), and what speaks against it is said (`confidence`).
+(`hypotheses`, `edits`), near ones by how the pictures match on the unrolled arch (`rivals`,
+`unrolled`), the best one is refined with these matches, and what speaks against it is said
+(`confidence`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
 from pipeline.kernels.threads import in_threads
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
-from stages.init.dental.cameras.bundle import view_angles
+from stages.init.dental.cameras.bundle import Matches, view_angles
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
 from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo
 from stages.init.dental.landmarks import Landmark
@@ -49,7 +50,7 @@ from stages.init.dental.numbering.hypotheses import (
 )
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
 from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
-from stages.init.dental.numbering.rivals import label_doubts, margins
+from stages.init.dental.numbering.rivals import judged_by_pictures, label_doubts, margins
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.template import landmark_names, position_of, tooth_at
@@ -157,16 +158,26 @@ def fit_arch(
         if rival_cost < cost:
             scorer, best, others, primary = child, rival, rivals, rival_primary
     best, ends = settle_ends(scorer, best, fixed)
+    others += ends
+    matching = _Matching(
+        scorer, read, [images[i] for i in placeable], [valid[i] for i in placeable], options
+    )
+    if options.dense_rounds:
+        numbered = best.labelling
+        best, others = judged_by_pictures(best, others, matching.shares)
+        if best.labelling != numbered:
+            best, ends = settle_ends(scorer, best, fixed)
+            others += ends
+            _, primary = primary_teeth(scorer, best, read)
     gaps = margins(best, others)
-    shares = label_doubts(best, [*others, *ends], options.min_margin)
+    shares = label_doubts(best, others, options.min_margin)
     if primary != best.labelling.primary:
         start = (best.adjusted.unknowns, best.adjusted.offsets)
         best = scorer.solve(replace(best.labelling, primary=primary), start)
     common = common_mouth(scorer, best)
     mirrored = mirror_evidence(scorer, best, read)
 
-    best, pairs = _refine(scorer, best, read, [images[i] for i in placeable],
-                          [valid[i] for i in placeable], options, progress)  # fmt: skip
+    best, pairs = matching.refined(best, progress)
     bands = [dentition.band_height for dentition in read]
     colours = colour_distances([images[i] for i in placeable], read)
     evidence = Evidence(gaps, common, mirrored, colours, bands, pairs)
@@ -332,34 +343,61 @@ def _kind_doubts(best: Scored, dentitions: list[Dentition], photos: list[str]) -
     )
 
 
-def _refine(
-    scorer: Scorer,
-    best: Scored,
-    dentitions: list[Dentition],
-    images: list[Image],
-    valid: list[Mask],
-    options: ArchOptions,
-    progress: Progress,
-) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
-    """The cameras of a numbering: rounds of dense matches on the unrolled arch and bundle
-    adjustment."""
-    offsets = best.adjusted.offsets * (options.numbering_deviation / options.landmark_deviation)
-    best = scorer.solve(
-        best.labelling, (best.adjusted.unknowns, offsets), deviation=options.landmark_deviation
-    )
-    photos = in_threads(
-        lambda photo: prepare_photo(
-            photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
-        ),
-        zip(images, valid, dentitions, strict=True),
-        scorer.threads,
-    )
-    pairs: dict[tuple[int, int], PairFigures] = {}
-    # With cameras that are known, matches can only speak for or against them.
-    rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds
-    for done in range(rounds):
-        progress("dense matches on the arch", done, rounds)
-        yaws = view_angles(best.adjusted)[:, 0]
+class _Matching:
+    """Dense matches of the photographs of a fit, on the arch that a labelling unrolls."""
+
+    def __init__(
+        self, scorer: Scorer, dentitions: list[Dentition], images: list[Image],
+        valid: list[Mask], options: ArchOptions,
+    ) -> None:  # fmt: skip
+        self._scorer, self._options = scorer, options
+        self._photos = in_threads(
+            lambda photo: prepare_photo(
+                photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
+            ),
+            zip(images, valid, dentitions, strict=True),
+            scorer.threads,
+        )
+
+    def shares(self, scored: Scored) -> dict[tuple[int, int], float]:
+        """Pair of views -> the share of what both see that matches, cameras as the teeth say."""
+        pairs = self._matched(self._as_cameras(scored))[1]
+        return {pair: figures.share for pair, figures in pairs.items()}
+
+    def refined(
+        self, best: Scored, progress: Progress
+    ) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
+        """The cameras of a numbering: rounds of dense matches and bundle adjustment."""
+        scorer, options = self._scorer, self._options
+        best = self._as_cameras(best)
+        pairs: dict[tuple[int, int], PairFigures] = {}
+        # With cameras that are known, matches can only speak for or against them.
+        rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds
+        for done in range(rounds):
+            progress("dense matches on the arch", done, rounds)
+            matches, pairs = self._matched(best)
+            if not scorer.held:
+                start = (best.adjusted.unknowns, best.adjusted.offsets)
+                best = scorer.solve(
+                    best.labelling, start, matches=matches, deviation=options.landmark_deviation
+                )
+        progress("dense matches on the arch", rounds, rounds)
+        return best, pairs
+
+    def _as_cameras(self, scored: Scored) -> Scored:
+        """Solved for its cameras rather than to compare it with others."""
+        options = self._options
+        offsets = scored.adjusted.offsets * (
+            options.numbering_deviation / options.landmark_deviation
+        )
+        return self._scorer.solve(
+            scored.labelling, (scored.adjusted.unknowns, offsets),
+            deviation=options.landmark_deviation,
+        )  # fmt: skip
+
+    def _matched(self, scored: Scored) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
+        """Dense matches of neighbouring photographs."""
+        yaws = view_angles(scored.adjusted)[:, 0]
         order = np.argsort(yaws, kind="stable")
         wanted = {(int(a), int(b)) for a, b in pairwise(order)}
         wanted |= {
@@ -367,16 +405,10 @@ def _refine(
             for a, b in zip(order[:-2], order[2:], strict=True)
             if yaws[b] - yaws[a] < MATCHED_YAW
         }
-        matches, pairs = dense_matches(
-            best.adjusted, photos, sorted(wanted), options.chart_scale, options.dense_weight
-        )
-        if not scorer.held:
-            start = (best.adjusted.unknowns, best.adjusted.offsets)
-            best = scorer.solve(
-                best.labelling, start, matches=matches, deviation=options.landmark_deviation
-            )
-    progress("dense matches on the arch", rounds, rounds)
-    return best, pairs
+        return dense_matches(
+            scored.adjusted, self._photos, sorted(wanted), self._options.chart_scale,
+            self._options.dense_weight,
+        )  # fmt: skip
 
 
 def _outcome(

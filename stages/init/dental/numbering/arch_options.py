@@ -74,8 +74,8 @@ class ArchOptions:
     #: Or, if the camera chose a white balance for each photograph: the places count less, colours
     #: only by the contrast of gum and enamel, and dense matches by the logarithm of their share
     #: over the usual one; together they must make good what colours no longer say. Unit, weight and
-    #: cost were chosen on twelve patients, each altered in seven ways (76 of 84 pass), against the
-    #: 396 ways to put a photograph of one of them among two of another (5 passed when chosen).
+    #: cost were chosen on twelve patients, each altered in seven ways (77 of 84 pass), against the
+    #: 396 ways to put a photograph of one of them among two of another (5 pass).
     any_light_places: float = 0.33
     any_light_colour_weight: float = 2.0
     any_light_match_weight: float = 3.0
