@@ -105,7 +105,8 @@ def test_pictures_of_other_teeth_speak_against_a_shifted_row() -> None:
         asked.append(labelling)
         return IN_PLACE if labelling is best else OFF
 
-    winner, (first, second, third) = judged_by_pictures(best, [moved, like, far], shares)
+    end = scored(-0.5, (RIGHT[0], (-1, *RIGHT[1][1:])), FRONT, LEFT)  # a trace better: left, before
+    winner, (*_, first, second, third) = judged_by_pictures(best, [end, moved, like, far], shares)
     assert winner is best
     assert asked == [best, moved]
     assert first.score == pytest.approx(5 + 4.7 * math.log(0.042 / 0.007))

@@ -91,11 +91,13 @@ def judged_by_pictures(
                     return replace(other, score=other.score + cost)
         return other
 
-    judged_others = [judged(other) for other in others]
-    winner = min(judged_others, key=lambda s: (s.score, s.labelling.labels))
+    after = [judged(other) for other in others]
+    # others may be a trace better than the best, and were not worth a change
+    asked = [new for old, new in zip(others, after, strict=True) if new is not old]
+    winner = min(asked, key=lambda s: (s.score, s.labelling.labels))
     if winner.score >= best.score:
-        return best, judged_others
-    return winner, [best, *(other for other in judged_others if other is not winner)]
+        return best, after
+    return winner, [best, *(other for other in after if other is not winner)]
 
 
 def _alike(a: Scored, b: Scored) -> bool:
