@@ -7,6 +7,7 @@ landmarks they look nearly alike, and optical flow finds what is left between th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.kernels.threads import one_opencv_thread
-from stages.init.dental.cameras.bundle import Adjusted, Matches
+from stages.init.dental.cameras.bundle import Adjusted, Matches, view_angles
 from stages.init.dental.template import GUM_STEPS, landmark_names
 
 Array = npt.NDArray[np.float64]
@@ -45,6 +46,8 @@ CORRELATION_WINDOW, STEP = 1.75, 0.5
 MIN_VARIANCE = 150.0
 #: Standard deviation of a match across its epipolar line, as a share of the band.
 MATCH_DEVIATION = 0.015
+#: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
+MATCHED_YAW = 32.0
 #: Fewer matches than this are not used.
 MIN_MATCHES = 20
 
@@ -332,3 +335,18 @@ def dense_matches(
         ),
         figures,
     )
+
+
+def match_neighbours(
+    adjusted: Adjusted, photos: list[Photo], scale: float, total_weight: float
+) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
+    """`dense_matches` of neighbouring photographs, and of those but one apart that are near."""
+    yaws = view_angles(adjusted)[:, 0]
+    order = np.argsort(yaws, kind="stable")
+    wanted = {(int(a), int(b)) for a, b in pairwise(order)}
+    wanted |= {
+        (int(a), int(b))
+        for a, b in zip(order[:-2], order[2:], strict=True)
+        if yaws[b] - yaws[a] < MATCHED_YAW
+    }
+    return dense_matches(adjusted, photos, sorted(wanted), scale, total_weight)

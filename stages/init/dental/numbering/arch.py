@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +19,9 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
 from pipeline.kernels.threads import in_threads
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
-from stages.init.dental.cameras.bundle import Matches, view_angles
+from stages.init.dental.cameras.bundle import Matches
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
-from stages.init.dental.cameras.unrolled import PairFigures, dense_matches, prepare_photo
+from stages.init.dental.cameras.unrolled import PairFigures, match_neighbours, prepare_photo
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import colour_distances
@@ -30,7 +29,10 @@ from stages.init.dental.numbering.confidence import (
     Evidence,
     case_confidence,
     fit_doubts,
+    kind_doubts,
     landmark_errors,
+    plain_role,
+    role_doubts,
 )
 from stages.init.dental.numbering.edits import (
     MIN_GAIN,
@@ -42,6 +44,7 @@ from stages.init.dental.numbering.edits import (
 )
 from stages.init.dental.numbering.hypotheses import (
     MAIN_ROLES,
+    Labelling,
     Scored,
     Scorer,
     roles_of_view,
@@ -61,6 +64,7 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
+_FirstRound = tuple[Scored, Matches, dict[tuple[int, int], PairFigures]]
 
 #: A photograph needs this many crowns in all to be placed.
 MIN_CROWNS = 4
@@ -68,8 +72,6 @@ MIN_CROWNS = 4
 EDITED, EDIT_WINDOW = 3, 40.0
 #: Then labellings shifted by a tooth that are no more than this worse are edited too, so often.
 SHIFTS, EDIT_GAP = 3, 30.0
-#: Photographs further apart than this are not matched densely unless they are neighbours (degrees).
-MATCHED_YAW = 32.0
 #: How far away known cameras are, they say themselves: hardly any prior (relative deviation).
 HELD_DISTANCE_DEVIATION = 0.5
 #: The millimetres rest on the size of a textbook arch: relative standard deviation.
@@ -147,7 +149,7 @@ def fit_arch(
         )  # fmt: skip
         doubts += contradiction
     elif len(placeable) == 3:
-        doubts += _role_doubts(best)
+        doubts += role_doubts(best)
     cost, primary = primary_teeth(scorer, best, read)
     if perhaps_primary(read):
         # A child's arch may tell another numbering than an adult's.
@@ -182,7 +184,7 @@ def fit_arch(
     colours = colour_distances([images[i] for i in placeable], read)
     evidence = Evidence(gaps, common, mirrored, colours, bands, pairs)
     more, figures = fit_doubts(shown, scorer, best, evidence, options)
-    doubts += more + _kind_doubts(best, read, shown)
+    doubts += more + kind_doubts(best, read, shown)
     found = _outcome(
         scorer, best, read, placeable, len(dentitions), gaps.cameras, doubts, figures, shares
     )
@@ -300,47 +302,16 @@ def _keep_order(
     if found == given or free_best.score > best.score - ordered.options.min_margin:
         return best, others, ordered, []
     wrong = [
-        f"{photo} (given as {_plain(a)}, looks like {_plain(b)})"
+        f"{photo} (given as {plain_role(a)}, looks like {plain_role(b)})"
         for photo, a, b in zip(photos, given, found, strict=True)
-        if _plain(a) != _plain(b)
+        if plain_role(a) != plain_role(b)
     ]
-    sides = {_plain(a) for a, b in zip(given, found, strict=True) if a != b}
+    sides = {plain_role(a) for a, b in zip(given, found, strict=True) if a != b}
     hint = "the order is wrong"
     if sides == {"right", "left"}:
         hint = "left and right are swapped, or the photographs are mirrored"
     sentence = f"the order given contradicts the teeth: {hint}; see {', '.join(wrong)}"
     return free_best, free_others, free, [sentence] if wrong else []
-
-
-def _plain(role: str) -> str:
-    """The role's name as users know it."""
-    return "between" if role.startswith("between") else role
-
-
-def _role_doubts(best: Scored) -> list[str]:
-    """Three photographs are one from each side and one from the front."""
-    roles = best.labelling.roles
-    absent = [role for role in MAIN_ROLES if role not in roles]
-    if not absent:
-        return []
-    twice = [role for role in MAIN_ROLES if roles.count(role) > 1]
-    return [
-        f"{roles.count(twice[0])} photographs look like {twice[0]} views and none like a "
-        f"{' or a '.join(absent)} view: one of them may be mirrored, or taken twice"
-    ]
-
-
-def _kind_doubts(best: Scored, dentitions: list[Dentition], photos: list[str]) -> list[str]:
-    """One photograph may look like what it is not; two are a wrong numbering."""
-    kinds = {"right": "right", "left": "left", "front": "frontal"}
-    odd = [
-        f"{photos[view]} (looks like {kinds[dentitions[view].kind]}, its teeth like {role})"
-        for view, role in zip(best.labelling.views, best.labelling.roles, strict=True)
-        if role in MAIN_ROLES and kinds.get(dentitions[view].kind, role) != role
-    ]
-    return [f"photographs don't show the sides that they look like: {', '.join(odd)}"] * (
-        len(odd) > 1
-    )
 
 
 class _Matching:
@@ -351,6 +322,7 @@ class _Matching:
         valid: list[Mask], options: ArchOptions,
     ) -> None:  # fmt: skip
         self._scorer, self._options = scorer, options
+        self._first: dict[Labelling, _FirstRound] = {}
         self._photos = in_threads(
             lambda photo: prepare_photo(
                 photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
@@ -361,7 +333,7 @@ class _Matching:
 
     def shares(self, scored: Scored) -> dict[tuple[int, int], float]:
         """Pair of views -> the share of what both see that matches, cameras as the teeth say."""
-        pairs = self._matched(self._as_cameras(scored))[1]
+        _, _, pairs = self._first_round(scored)
         return {pair: figures.share for pair, figures in pairs.items()}
 
     def refined(
@@ -369,13 +341,15 @@ class _Matching:
     ) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
         """The cameras of a numbering: rounds of dense matches and bundle adjustment."""
         scorer, options = self._scorer, self._options
-        best = self._as_cameras(best)
-        pairs: dict[tuple[int, int], PairFigures] = {}
+        if not options.dense_rounds:
+            return self._as_cameras(best), {}
+        best, matches, pairs = self._first_round(best)
         # With cameras that are known, matches can only speak for or against them.
         rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds
         for done in range(rounds):
             progress("dense matches on the arch", done, rounds)
-            matches, pairs = self._matched(best)
+            if done:
+                matches, pairs = self._matched(best)
             if not scorer.held:
                 start = (best.adjusted.unknowns, best.adjusted.offsets)
                 best = scorer.solve(
@@ -383,6 +357,19 @@ class _Matching:
                 )
         progress("dense matches on the arch", rounds, rounds)
         return best, pairs
+
+    def _first_round(self, scored: Scored) -> _FirstRound:
+        """Solved for its cameras, and the matches on their arch; once for each labelling."""
+        if scored.labelling not in self._first:
+            solved = self._as_cameras(scored)
+            self._first[scored.labelling] = (solved, *self._matched(solved))
+        return self._first[scored.labelling]
+
+    def _matched(self, scored: Scored) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
+        options = self._options
+        return match_neighbours(
+            scored.adjusted, self._photos, options.chart_scale, options.dense_weight
+        )
 
     def _as_cameras(self, scored: Scored) -> Scored:
         """Solved for its cameras rather than to compare it with others."""
@@ -393,21 +380,6 @@ class _Matching:
         return self._scorer.solve(
             scored.labelling, (scored.adjusted.unknowns, offsets),
             deviation=options.landmark_deviation,
-        )  # fmt: skip
-
-    def _matched(self, scored: Scored) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
-        """Dense matches of neighbouring photographs."""
-        yaws = view_angles(scored.adjusted)[:, 0]
-        order = np.argsort(yaws, kind="stable")
-        wanted = {(int(a), int(b)) for a, b in pairwise(order)}
-        wanted |= {
-            (int(a), int(b))
-            for a, b in zip(order[:-2], order[2:], strict=True)
-            if yaws[b] - yaws[a] < MATCHED_YAW
-        }
-        return dense_matches(
-            scored.adjusted, self._photos, sorted(wanted), self._options.chart_scale,
-            self._options.dense_weight,
         )  # fmt: skip
 
 
@@ -436,7 +408,7 @@ def _outcome(
         views[photo] = PlacedView(
             cam_from_world=pose,
             focal=float(adjusted.focals[view]),
-            role=_plain(labelling.roles[view]),
+            role=plain_role(labelling.roles[view]),
             upper=_teeth(0, labelling.labels[view][0]),
             lower=_teeth(1, labelling.labels[view][1]),
             upper_doubts=crown_shares[view][0],

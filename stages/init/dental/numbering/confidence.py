@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.teeth import Dentition
 from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance
-from stages.init.dental.numbering.hypotheses import Scored, Scorer
+from stages.init.dental.numbering.hypotheses import MAIN_ROLES, Scored, Scorer
 from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
 from stages.init.dental.numbering.rivals import Margins
 
@@ -264,3 +265,34 @@ def _view_doubts(
                 f"badly, a mirrored photograph or another patient"
             )
     return doubts
+
+
+def plain_role(role: str) -> str:
+    """The role's name as users know it."""
+    return "between" if role.startswith("between") else role
+
+
+def role_doubts(best: Scored) -> list[str]:
+    """Three photographs are one from each side and one from the front."""
+    roles = best.labelling.roles
+    absent = [role for role in MAIN_ROLES if role not in roles]
+    if not absent:
+        return []
+    twice = [role for role in MAIN_ROLES if roles.count(role) > 1]
+    return [
+        f"{roles.count(twice[0])} photographs look like {twice[0]} views and none like a "
+        f"{' or a '.join(absent)} view: one of them may be mirrored, or taken twice"
+    ]
+
+
+def kind_doubts(best: Scored, dentitions: list[Dentition], photos: list[str]) -> list[str]:
+    """One photograph may look like what it is not; two are a wrong numbering."""
+    kinds = {"right": "right", "left": "left", "front": "frontal"}
+    odd = [
+        f"{photos[view]} (looks like {kinds[dentitions[view].kind]}, its teeth like {role})"
+        for view, role in zip(best.labelling.views, best.labelling.roles, strict=True)
+        if role in MAIN_ROLES and kinds.get(dentitions[view].kind, role) != role
+    ]
+    return [f"photographs don't show the sides that they look like: {', '.join(odd)}"] * (
+        len(odd) > 1
+    )
