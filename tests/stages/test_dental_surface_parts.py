@@ -219,30 +219,51 @@ def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
     return np.array(corners) + 0.5
 
 
-def test_gum_is_found_beside_the_teeth_and_gloves_are_not() -> None:
+def gum_of(*marks: tuple[slice, slice, list[int]]) -> np.ndarray:
+    """[120, 200] bool: gum found in a picture of teeth and gum, a quarter of a mm a pixel.
+
+    Args:
+        marks: rows, columns and colour (8-bit Lab) of what else is there.
+    """
     height, width = 120, 200
     lab = np.zeros((height, width, 3), np.float32)
     lab[:] = [20, 5, 3]  # the dark of the mouth
     lab[20:100, 20:180] = [140, 32, 18]  # gum
-    lab[:26] = [215, 8, 10]  # a glove at the top
     lab[45:75, 40:160] = [200, 2, 25]  # teeth
-    lab[32:36, 90:97] = [250, 2, 2]  # a wet highlight on the gum
+    for rows, columns, colour in marks:
+        lab[rows, columns] = colour
+    shiny = lab[..., 0] > 230
     lab += np.random.default_rng(0).normal(0, 2, lab.shape).astype(np.float32)
     tooth = np.zeros((height, width), bool)
     tooth[45:75, 40:160] = True
-    rows = [
+    jaws = [
         Crown(jaw, *np.zeros((2, 2)), *[None] * 4, 9.0, 9.0, outline=rectangle(40, top, 160, end))
         for jaw, top, end in (("upper", 45, 60), ("lower", 60, 75))
     ]
-    dentition = Dentition("", (width, height), "front", (rows[0],), (rows[1],), 0.0, 30.0)
+    dentition = Dentition("", (width, height), "front", (jaws[0],), (jaws[1],), 0.0, 30.0)
     np.testing.assert_array_equal(dentition.mask, tooth)
-    gum = find_gum(lab, tooth, dentition, density=4.0, deviations=3.5)
+    gum = find_gum(lab, tooth, shiny, dentition, density=4.0, deviations=3.5)
+    assert not (gum & tooth).any()
+    assert not gum[104:].any()
+    return gum
+
+
+def test_gum_is_found_beside_the_teeth_and_gloves_are_not() -> None:
+    glove = np.s_[:26, :, [215, 8, 10]]
+    gum = gum_of(glove, np.s_[32:36, 90:97, [250, 2, 2]])  # and a wet highlight on the gum
     assert gum[30:43, 30:170].mean() > 0.98
     assert gum[78:97, 30:170].mean() > 0.98
     assert gum[32:36, 90:97].all()
     assert not gum[:24].any()
-    assert not gum[104:].any()
-    assert not (gum & tooth).any()
+
+
+def test_a_large_highlight_within_the_gum_is_gum_and_a_retractor_is_not() -> None:
+    """It covers 44 square mm; those of 48 photographs come to 73."""
+    large, core = np.s_[79:93, 60:110], np.s_[83:89, 70:100, [250, 2, 2]]
+    assert gum_of((*large, [205, 20, 12]), core)[large].all()
+    # As large and as light, but grey; and red, but no lighter than the gum.
+    assert gum_of((*large, [205, 6, 4]), core)[large].mean() < 0.05
+    assert gum_of((*large, [130, 58, 40]), core)[large].mean() < 0.35
 
 
 def test_gains_undo_exposures() -> None:

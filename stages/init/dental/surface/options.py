@@ -29,7 +29,7 @@ class SurfaceOptions:
     """Settings of `dense_surface`. Lengths are millimetres of the arch frame."""
 
     # samples per mm of the unrolled charts
-    chart_density: float = 8.0
+    chart_density: float = 7.0
     # how far each crown bulges between its zenith and its tip
     crown_bulge: float = 0.8
     # power by which a crown falls towards its neighbours; larger: flatter in front, steeper beside
@@ -89,4 +89,4 @@ class SurfaceOptions:
     # power of the cosine by which views share in the colour
     colour_power: float = 6.0
     # distance of the points of the cloud
-    cloud_spacing: float = 0.12
+    cloud_spacing: float = 0.14

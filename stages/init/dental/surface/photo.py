@@ -32,7 +32,11 @@ _GUM_SPREAD = (14.0, 4.0, 4.5)
 _PALE = 1.8
 #: Holes in tooth and gum up to this size (square mm) that are not dark are wet highlights, or
 #: crowns of another colour.
-_WET = 30.0
+_BRIGHT_HOLE = 30.0
+#: Highlights that tissue encloses may be so large (square mm; the largest of 48 photographs: 73).
+#: Most of one is lighter than the gum by more than shade makes it darker, and of what is not white
+#: at least so much is red: retractors are grey, lips and cheeks that look like a hole are darker.
+_HIGHLIGHT, _RED_SHARE = 80.0, 0.85
 #: Not dark: lighter than so much of the gum.
 _LIT = 0.6
 #: Share of that size up to which a hole is a speck, bright or not.
@@ -205,8 +209,8 @@ def prepare_photo(
     lab = _lab(image)
     tooth = dentition.mask & valid
     void = find_void(lab[..., 0], tooth, density)
-    gum = find_gum(lab, tooth, dentition, density, gum_deviations) & valid & ~void
     shiny = highlights(image)
+    gum = find_gum(lab, tooth, shiny > 0, dentition, density, gum_deviations) & valid & ~void
     return Photo(
         index=index,
         camera=camera,
@@ -241,7 +245,12 @@ def _texture(lab: Array32, density: float) -> Array32:
 
 
 def find_gum(
-    lab: Array32, tooth: Mask, dentition: Dentition, density: float, deviations: float
+    lab: Array32,
+    tooth: Mask,
+    shiny: Mask,
+    dentition: Dentition,
+    density: float,
+    deviations: float,
 ) -> Mask:
     """Gum around the teeth, told from gloves, lips, retractors and the dark by its colour.
 
@@ -251,6 +260,7 @@ def find_gum(
     Args:
         lab: [H, W, 3] float32, 8-bit scaling.
         tooth: [H, W] bool.
+        shiny: [H, W] bool, highlights.
         dentition: the teeth.
         density: pixels per mm.
         deviations: furthest colour, in standard deviations.
@@ -278,9 +288,10 @@ def find_gum(
     # Small wet highlights on the gum are gum; thin red seams of a glove are not.
     closed = cv2.morphologyEx((like | tooth).astype(np.uint8), cv2.MORPH_CLOSE, small)
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, small) > 0
-    tissue = _fill_bright_holes(
-        opened | tooth, smooth[..., 0] > _LIT * middle[0], _WET * density**2
-    )
+    tissue = opened | tooth
+    lit, light = (smooth[..., 0] > level for level in (_LIT * middle[0], middle[0] + _GUM_SHADE))
+    tissue = tissue | _bright_holes(tissue, lit, _BRIGHT_HOLE * density**2)
+    tissue = tissue | _highlights_within(tissue, light, red, shiny, _HIGHLIGHT * density**2)
     return joined_to(tissue, tooth) & ~tooth
 
 
@@ -319,14 +330,29 @@ def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:
     return np.asarray(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, narrow) > 0)
 
 
-def _fill_bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:
-    """Fill holes of at most `most` pixels, most of which are bright."""
+def _bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:
+    """Holes of at most `most` pixels, most of which are bright."""
     count, label = cv2.connectedComponents((~tissue).astype(np.uint8), connectivity=4)
     area = np.bincount(label.ravel(), minlength=count)
     lit = np.bincount(label[bright], minlength=count)
     hole = ((area <= most) & (lit > 0.7 * area)) | (area <= most * _SPECK)
     hole[0] = False
-    return tissue | hole[label]
+    return hole[label]
+
+
+def _highlights_within(tissue: Mask, light: Mask, red: Mask, shiny: Mask, most: float) -> Mask:
+    """Holes of at most `most` pixels that tissue encloses, lighter than it and as red."""
+    count, label = cv2.connectedComponents((~tissue).astype(np.uint8), connectivity=4)
+
+    def pixels(mask: Mask) -> npt.NDArray[np.int64]:
+        return np.bincount(label[mask], minlength=count)
+
+    area = pixels(~tissue)
+    hole = (area <= most) & (pixels(light) > area / 2)
+    hole &= pixels(red & ~shiny) >= _RED_SHARE * pixels(~shiny)
+    hole[np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])] = False
+    hole[0] = False
+    return hole[label]
 
 
 def _gumwards(tooth: Mask, dentition: Dentition) -> Mask:
