@@ -120,15 +120,25 @@ class Dentition:
 
     @cached_property
     def above(self) -> Bool:
-        """[H, W] True where the nearest crown is one of the upper jaw."""
+        """[H, W] True on the upper jaw's side: on its crowns, and beyond them from where both meet.
+
+        They meet midway between the lines through their crowns' tips. Nearest crowns would not do:
+        in a deep bite those of the lower jaw are hidden, and its gum is next to upper ones.
+        """
         width, height = self.size
         if not self.upper or not self.lower:
             return np.full((height, width), bool(self.upper))
-        distances = [
-            cv2.distanceTransform((~filled(crowns, self.size)).astype(np.uint8), cv2.DIST_L2, 5)
-            for crowns in (self.upper, self.lower)
-        ]
-        return np.asarray(distances[0] <= distances[1])
+        turn = np.array([np.cos(self.roll), np.sin(self.roll)])
+        y, x = np.mgrid[:height, :width] + 0.5
+        along, across = x * turn[0] + y * turn[1], y * turn[0] - x * turn[1]
+        meeting = np.zeros((height, width))
+        for crowns in (self.upper, self.lower):
+            tips = np.array([crown.tip for crown in crowns])
+            places, heights = tips @ turn, tips @ [-turn[1], turn[0]]
+            order = np.argsort(places, kind="stable")
+            meeting += np.interp(along, places[order], heights[order]) / 2
+        upper, lower = (filled(crowns, self.size) for crowns in (self.upper, self.lower))
+        return np.asarray(upper | ((across < meeting) & ~lower))
 
 
 def filled(crowns: tuple[Crown, ...], size: tuple[int, int]) -> Bool:

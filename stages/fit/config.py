@@ -53,7 +53,7 @@ class Basics(PartSettings):
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
     bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
     same images and gradients in a first trial)"""
-    iterations: AutoInt = automatic({3: 400, 6: 500, 12: 600, 24: 700}, held=160, ge=1)
+    iterations: AutoInt = automatic({3: 400, 6: 500, 12: 600, 24: 700}, held=200, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail
     # larger views of what isn't held don't need more: with twice as many at 1024 px, unseen views

@@ -205,14 +205,38 @@ def test_outline_of_a_mask_fills_to_the_mask() -> None:
     np.testing.assert_array_equal(filled((crown(outline),), (WIDTH, HEIGHT)), shape > 0)
 
 
-def test_above_is_where_the_upper_crowns_are_nearer() -> None:
-    view = dentition()
+def test_above_is_the_side_of_the_upper_crowns() -> None:
+    view = replace(dentition(), roll=0.0)
     assert view.above.shape == (HEIGHT, WIDTH)
     assert view.above[:36].all()
     assert not view.above[40:, 22:42].any()
     only = replace(view, lower=())
     assert only.above.all()
     assert not replace(view, upper=()).above.any()
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.5, -0.5])
+def test_gum_below_upper_crowns_is_the_lower_jaws(roll: float) -> None:
+    """In a deep bite the lower front teeth are hidden: their gum is next to upper crowns."""
+    c, s = np.cos(roll), np.sin(roll)
+
+    def turned(points: np.ndarray) -> np.ndarray:
+        return (points - [60, 40]) @ np.array([[c, s], [-s, c]]) + [60, 40]
+
+    def placed(left: float, top: float, tip: float) -> Crown:
+        ends = turned(np.array([[left + 5.0, top], [left + 5.0, tip]]))
+        low, high = sorted((top, tip))
+        return replace(crown(turned(box(left, low, 10, high - low))), zenith=ends[0], tip=ends[1])
+
+    upper = tuple(placed(left, 25, 42) for left in (30, 40, 50, 60, 70, 80))
+    lower = tuple(placed(left, 55, 38) for left in (20, 90))  # nothing between them
+    view = replace(dentition(), upper=upper, lower=lower, roll=roll)
+
+    def above(*points: tuple[float, float]) -> list[bool]:
+        return [bool(view.above[int(y), int(x)]) for x, y in turned(np.array(points))]
+
+    assert above((35, 30), (55, 41), (60, 20), (95, 33), (25, 33)) == [True] * 5
+    assert above((55, 44), (60, 50), (75, 44), (25, 45), (95, 45), (60, 62)) == [False] * 6
 
 
 def test_a_crown_in_the_corner_or_without_an_outline_harms_nothing() -> None:
