@@ -171,9 +171,12 @@ def scene(yaws=(-40.0, 0.0, 40.0), missing=None, exposures=(0.9, 1.0, 1.0)):  # 
         for number, model in enumerate(JAWS, 1):
             kept = [t for t in TEETH[model.jaw] if t != missing]
             facing = [t for t in kept if abs(np.degrees(model.centres()[t]) - yaw) < 75]
-            # All the jaw's enamel is outlined, in one piece: the crowns have no landmarks here.
-            crown = Crown(model.jaw, np.zeros(2), np.zeros(2), None, None, None, None, 15.0, 22.0)
-            whole = replace(crown, outline=outline((kind == 2) & (jaw == number)))
+            # All the jaw's enamel is outlined in one piece, and all crowns have the same landmarks.
+            around = outline((kind == 2) & (jaw == number))
+            ends = [np.array([WIDTH / 2, edge(around[:, 1])]) for edge in (np.min, np.max)]
+            zenith, tip = ends if model.jaw == "upper" else ends[::-1]
+            crown = Crown(model.jaw, zenith, tip, None, None, None, None, 15.0, 22.0)
+            whole = replace(crown, outline=around)
             crowns[model.jaw] = (whole, *(crown,) * (len(facing) - 1))
             names[model.jaw] = tuple(facing)
         size = (WIDTH, HEIGHT)

@@ -102,7 +102,7 @@ class Course:
 @pytest.mark.parametrize(
     ("changes", "views", "held", "expected"),
     [
-        ({}, 3, True, [80, 104, 128]),
+        ({}, 3, True, [100, 130, 160]),
         ({}, 3, False, [280, 316, 352]),
         ({"iterations": 100}, 12, False, [70]),
         ({"iterations": 100, "coarse_factor": 4, "detail_rounds": 1}, 12, False, [35, 70, 88]),
