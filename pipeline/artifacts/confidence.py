@@ -1,8 +1,10 @@
 """What a raw confidence says of a depth or a point.
 
-Raw confidences are at least 1, as pointmap models give them. At 1 nothing is known. Up to `FILLED`
-a depth was filled in from what lies around it; up to `MEASURED` it is a guess with a reason (the
-shape of crowns, one weak match); above, photographs agree on it.
+Raw confidences are at least 1, as pointmap models give them. At 1 nothing is known. Up to
+`COMPLETED` a depth goes on from what lies around it in the picture. Up to `FILLED` it is the shape
+that crowns have, where one photograph alone shows them: mm off, not cm. Both fill: they are used
+where nothing better is. Up to `MEASURED` it is a guess with a reason (crowns' shape under exact
+cameras, one weak match); above, photographs agree on it.
 """
 
-FILLED, MEASURED = 1.25, 1.5
+COMPLETED, FILLED, MEASURED = 1.2, 1.25, 1.5

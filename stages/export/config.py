@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from pipeline.artifacts.confidence import FILLED
+from pipeline.artifacts.confidence import COMPLETED
 from pipeline.artifacts.space.frames import WANTED, Wanted
 from pipeline.stage import StageConfig
 
@@ -46,10 +46,11 @@ class ExportConfig(StageConfig):
         "photograph shows",
     )
     mesh_confidence: float = Field(
-        FILLED,
+        COMPLETED,
         ge=0,
         description="only points with a confidence above this support the mesh: up to it their "
-        "depth was filled in, not measured",
+        "depth was completed from what lies around them; 1.25 leaves out what one photograph alone "
+        "shows, too (there the mesh is the shape that crowns have)",
     )
     mesh_jaws: bool = Field(
         True, description="write the mesh jaw by jaw as well, where crowns of both are known"

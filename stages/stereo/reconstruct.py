@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.confidence import COMPLETED
 from pipeline.geometry.order import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
@@ -344,7 +345,7 @@ def _finish(
         if options.fill and known.any():
             filled = _fill(index, stack, table, grays[index], confidence, others[index], options)
             filled = np.where(valid[index], filled, 0).astype(np.float32)
-            trust = 1.01 + 0.19 * np.exp(-distance_to(known) / 20)
+            trust = 1.01 + (COMPLETED - 1.01) * np.exp(-distance_to(known) / 20)
             confidence = np.where(known | (filled <= 0), confidence, trust).astype(np.float32)
         merged = np.where(known, depth, filled)
         weight = np.where(known, np.float32(1), np.float32(0.01))

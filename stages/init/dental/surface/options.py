@@ -80,7 +80,7 @@ class SurfaceOptions:
     gum_trust: float = 0.2
     # a pixel is gum if its colour is within so many standard deviations of that beside the crowns
     gum_deviations: float = 3.5
-    # confidence where no photographs agree is 1 + exp(this)
+    # confidence where no photographs agree is 1 + exp(this): more than what is completed has
     guess: float = -1.6
     # rims are smoothed over this length
     rim_smoothing: float = 0.35
