@@ -113,6 +113,13 @@ class Dentition:
         """The crowns of both jaws."""
         return (*self.upper, *self.lower)
 
+    def levelled(
+        self, x: npt.NDArray[Any], y: npt.NDArray[Any]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Pixels x, y (any shape) along the row of teeth, and across it from above to below."""
+        c, s = np.cos(self.roll), np.sin(self.roll)
+        return x * c + y * s, y * c - x * s
+
     @cached_property
     def mask(self) -> Bool:
         """[H, W] True on teeth."""
@@ -128,13 +135,12 @@ class Dentition:
         width, height = self.size
         if not self.upper or not self.lower:
             return np.full((height, width), bool(self.upper))
-        turn = np.array([np.cos(self.roll), np.sin(self.roll)])
         y, x = np.mgrid[:height, :width] + 0.5
-        along, across = x * turn[0] + y * turn[1], y * turn[0] - x * turn[1]
+        along, across = self.levelled(x, y)
         meeting = np.zeros((height, width))
         for crowns in (self.upper, self.lower):
             tips = np.array([crown.tip for crown in crowns])
-            places, heights = tips @ turn, tips @ [-turn[1], turn[0]]
+            places, heights = self.levelled(tips[:, 0], tips[:, 1])
             order = np.argsort(places, kind="stable")
             meeting += np.interp(along, places[order], heights[order]) / 2
         upper, lower = (filled(crowns, self.size) for crowns in (self.upper, self.lower))

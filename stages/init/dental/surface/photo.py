@@ -357,10 +357,9 @@ def _highlights_within(tissue: Mask, light: Mask, red: Mask, shiny: Mask, most: 
 
 def _gumwards(tooth: Mask, dentition: Dentition) -> Mask:
     """[H, W] bool: beyond the row of teeth, not between the jaws."""
-    turn = np.array([np.sin(dentition.roll), np.cos(dentition.roll)])
     y, x = np.mgrid[: tooth.shape[0], : tooth.shape[1]]
-    across = y * turn[1] - x * turn[0]
-    along = np.rint(x * turn[1] + y * turn[0]).astype(np.int64)
+    places, across = dentition.levelled(x, y)
+    along = np.rint(places).astype(np.int64)
     along -= along.min()
     size = int(along.max()) + 1
     highest = np.full(size, np.inf)
