@@ -28,6 +28,7 @@ def test_every_stage_ran_and_told_its_figures(done: RunSummary) -> None:
     ]  # fmt: skip
     figures = {stage.name: stage.figures["summary"] for stage in done.stages}
     assert figures["init"]["views_registered"] == figures["init"]["views_total"] == 3
+    assert figures["init"]["completed_by_teeth"]
     assert figures["sap"]["points_after_pruning"] < figures["sap"]["points_before"]
     assert figures["fit"]["gaussians"] > 5000
     assert figures["evaluate"]["psnr"] > 25

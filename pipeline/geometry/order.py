@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -109,3 +111,24 @@ def nearest_views(
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
         ranked.append((seen.mean() < _LEAST_SHARE, -np.median((rays * towards).sum(1)), view))
     return np.array(sorted(view for _, _, view in sorted(ranked)[:most]), np.int64)
+
+
+def neighbour_angle(cameras: Sequence[Camera]) -> float:
+    """Median over the cameras of the angle to the nearest other one, in degrees.
+
+    Seen from the point that is nearest to all optical axes; 0 where all look the same way.
+    """
+    if len(cameras) < 2:
+        return 0.0
+    ahead = np.stack([camera.rotation[2] for camera in cameras])
+    centres = np.stack([camera.centre for camera in cameras])
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    system = across.sum(0)
+    if np.linalg.cond(system) > 1e6:
+        return 0.0
+    target = np.linalg.solve(system, np.einsum("vij,vj->i", across, centres))
+    lines = centres - target
+    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-12)
+    cosine = np.clip(lines @ lines.T, -1, 1)
+    np.fill_diagonal(cosine, -1)
+    return float(np.median(np.degrees(np.arccos(cosine.max(axis=1)))))

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
 from pipeline.artifacts.confidence import FILLED
 from pipeline.errors import ReconstructionError
 from pipeline.stage import Stage, StageConfig, StageContext
+
+if TYPE_CHECKING:
+    from pipeline.artifacts.cameras import Camera, Cameras
+
+#: So few photographs, no further apart than this (degrees): what is completed counts like what is
+#: measured.
+FEW_VIEWS, NEAR = 5, 30.0
 
 
 class AlignConfig(StageConfig):
@@ -88,9 +96,10 @@ class AlignConfig(StageConfig):
     match_focals_from: int = Field(
         6, ge=2, description="From so many views on, the matches also correct focal lengths."
     )
-    fill_confidence: float = Field(
-        FILLED, ge=1,
-        description="Depths of no more confidence count as fill: used where nothing better is.",
+    fill_confidence: Annotated[float, Field(ge=1)] | Literal["auto"] = Field(
+        "auto",
+        description="Depths of no more confidence count as fill: used where nothing better is. "
+        "auto: 1.25; 1, which is none, of up to 5 photographs near each other.",
     )  # fmt: skip
     fill_stride: int = Field(
         3, ge=1, le=64, description="Of the fill, one pixel in so many (in x and y) is taken."
@@ -116,7 +125,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 4
+    version = 5
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")
@@ -188,7 +197,8 @@ class AlignStage(Stage):
             [by_name[name].image for name in names],
             [start.cameras[name] for name in names],
             FusionOptions(
-                config.fill_confidence, config.fill_stride, config.relative_depth, config.front,
+                _fill_confidence(config, given, [start.cameras[name] for name in names]),
+                config.fill_stride, config.relative_depth, config.front,
                 config.min_agreeing, config.merge,
             ),
             context.threads,
@@ -223,6 +233,24 @@ class AlignStage(Stage):
             points=len(cloud), fill_points=cloud.fill, views=len(placed),
             views_total=len(views), **figures,
         )  # fmt: skip
+
+
+def _fill_confidence(
+    config: AlignConfig, given: Cameras | None, cameras: Sequence[Camera]
+) -> float:
+    """What `fill_confidence: auto` comes to.
+
+    What few photographs show is to a good part completed. Between near ones that is seldom off by
+    much, and left out it is missed; between wide ones it gets in the way of what is right. From six
+    on it hardly matters.
+    """
+    from pipeline.geometry.order import neighbour_angle
+
+    if config.fill_confidence != "auto":
+        return config.fill_confidence
+    found = given is not None and not given.provisional
+    near = len(cameras) <= FEW_VIEWS and neighbour_angle(cameras) <= NEAR
+    return 1.0 if found and near else FILLED
 
 
 def _kept(context: StageContext) -> bool:

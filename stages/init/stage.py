@@ -25,7 +25,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 24
+    version = 25
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -171,11 +171,11 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 def _from_features(context: StageContext, views: Views) -> None:
     """By features, or by teeth where these link photographs that features don't."""
+    from stages.init.densify import densify
     from stages.init.dental.choice import ByTeeth, neither
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
-    from stages.init.write import densify
 
     config: InitConfig = context.config
     free = config.method == "auto"
@@ -231,8 +231,8 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
     from pipeline.geometry.models.known_cameras import matching_cameras, read_cameras
+    from stages.init.densify import densify
     from stages.init.place import place_known
-    from stages.init.write import densify
 
     config: InitConfig = context.config
     cameras, units = read_cameras(_camera_files(context.sources), CAMERAS)
@@ -269,8 +269,8 @@ def _teeth_are_wide_apart(
 ) -> bool:
     """Few photographs of teeth with known cameras, too far apart for dense stereo."""
     from pipeline.geometry.models.known_cameras import pinhole_camera
+    from pipeline.geometry.order import neighbour_angle
     from stages.init.dental.choice import ByTeeth
-    from stages.init.dental.place_known import neighbour_angle
 
     config: InitConfig = context.config
     if config.dense.method != "auto":

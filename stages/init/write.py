@@ -17,73 +17,16 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import Scale, Source
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
-from pipeline.geometry import cloud
-from pipeline.geometry.graph import spanning_pairs
 from pipeline.stage import StageContext
 from stages.init.config import InitConfig
 from stages.init.mouth import mouth_frame, textbook_scale, tooth_places
 from stages.init.scale import mm_per_unit, photo_named
 from stages.init.sfm.matching.pictures import Links, match_pictures, match_table
-from stages.stereo import DenseOptions, dense_depths
 
 if TYPE_CHECKING:
     from pipeline.artifacts.teeth import Teeth
-    from stages.init.placement import Placement
 
 Map = npt.NDArray[np.float32]
-
-
-def densify(context: StageContext, views: Views, placement: Placement) -> None:
-    """Dense stereo from the cameras found, and everything written."""
-    config: InitConfig = context.config
-    cameras, points = placement.cameras, placement.points
-    images = [view.image for view in placement.views]
-    settings = config.dense.model_dump()
-    settings["method"] = "sgbm" if config.dense.method == "sgbm" else "sweep"
-    dense = dense_depths(
-        images,
-        [view.valid() for view in placement.views],
-        list(cameras),
-        [points[seen].astype(np.float32) for seen in placement.seen],
-        DenseOptions(**settings),
-        context.threads,
-        lambda done, total: context.progress("dense stereo", done, total),
-    )
-    clouds = [
-        cloud.depth_points(image, found.depth, found.normal, found.confidence, camera)
-        for image, found, camera in zip(images, dense, cameras, strict=True)
-    ]
-    dense_count = sum(len(found) for found in clouds)
-    if dense_count < config.min_dense_points:
-        context.warn(
-            f"Dense stereo found only {dense_count} points; the {len(points)} points of the sparse "
-            "reconstruction are added. The surface will have holes."
-        )
-        clouds.append(cloud.sparse_points(points, images, list(cameras)))
-    if config.fill_step:
-        for image, found, camera in zip(images, dense, cameras, strict=True):
-            rest = np.where(found.depth > 0, np.float32(0), found.filled)
-            clouds.append(
-                cloud.depth_points(
-                    image, rest, found.normal, found.confidence, camera, config.fill_step
-                )
-            )
-    result = cloud.thinned(cloud.joined(clouds), config.max_points, context.seed)
-    depths = [np.where(found.depth > 0, found.depth, found.filled) for found in dense]
-    tree = spanning_pairs(placement.weights)
-    pairs = [
-        cloud.pointmap_pair(
-            cameras[i], cameras[j], depths[i], depths[j], dense[i].confidence, dense[j].confidence
-        )
-        for i, j in cloud.pointmap_edges(placement.weights, tree, len(cameras))
-    ]
-    save_all(
-        context, views, placement.views,
-        placement.placed(), depths, result, pairs,
-    )  # fmt: skip
-    if placement.links is not None and config.match_pictures:
-        save_matches(context, placement.links, config.match_pictures)
-    context.summarize(sparse_points=len(points), dense_points=dense_count, **placement.figures)
 
 
 def save_matches(context: StageContext, links: Links, most: int) -> None:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.confidence import FILLED
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import Scale
@@ -20,7 +21,7 @@ from pipeline.geometry.depths import view_depths
 from pipeline.geometry.start import start_from_cameras, start_from_tree
 from pipeline.stage import LocalContext, get_stage
 from stages.align.fusion import FusionOptions, fuse
-from stages.align.stage import AlignConfig, AlignStage
+from stages.align.stage import AlignConfig, AlignStage, _fill_confidence
 from tests.stages import dense_scene as _scene
 
 ANGLES = (-24.0, -8.0, 6.0, 21.0)
@@ -222,6 +223,42 @@ def test_floaters_are_refuted_and_fill_yields_to_measurements(world):
     assert cloud.fill == 0
     alone = fuse([spoiled[1]], [trust[1]], images[1:2], cameras[1:2], FusionOptions(), 1)
     assert alone.fill == len(range(61, 70, 3)) * len(range(40, 60, 3))
+
+
+def turned(cameras: list[Camera], factor: float) -> list[Camera]:
+    """Cameras about the vertical axis, so much further around it."""
+    ahead = np.array([camera.rotation[2] for camera in cameras])
+    angles = np.arctan2(ahead[:, 0], ahead[:, 2]) * (factor - 1)
+    moved = []
+    for camera, angle in zip(cameras, angles, strict=True):
+        pose = camera.cam_from_world.copy()
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", angle).as_matrix().T
+        moved.append(replace(camera, cam_from_world=pose))
+    return moved
+
+
+@pytest.mark.parametrize(
+    ("count", "factor", "provisional", "setting", "expected"),
+    [
+        (4, 1.0, False, "auto", 1.0),
+        (5, 1.0, False, "auto", 1.0),
+        (6, 1.0, False, "auto", FILLED),
+        (4, 3.0, False, "auto", FILLED),
+        (4, 1.0, True, "auto", FILLED),
+        (4, 1.0, False, 1.4, 1.4),
+    ],
+    ids=["near", "five", "six", "wide", "provisional", "set"],
+)
+def test_what_is_completed_counts_in_full_between_few_near_photographs(
+    world, count, factor, provisional, setting, expected
+):
+    cameras = turned((world[0] * 2)[:count], factor)
+    if count > 4:  # no two in the same place
+        cameras[4:] = turned(cameras[4:], 0.5)
+    given = Cameras(tuple(cameras), provisional=provisional)
+    config = AlignConfig(fill_confidence=setting)
+    assert _fill_confidence(config, given, cameras) == expected
+    assert _fill_confidence(config, None, cameras) == (1.4 if setting == 1.4 else FILLED)
 
 
 def test_highlights_do_not_colour_the_cloud(world):

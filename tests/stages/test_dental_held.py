@@ -6,12 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.views import View
+from pipeline.geometry.order import neighbour_angle
 from stages.init.dental.cameras.bundle import CameraPriors, Sightings, adjust
 from stages.init.dental.cameras.centred import centre_view
 from stages.init.dental.cameras.held import HeldCameras, nearest_similarity
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.place_known import neighbour_angle
 from stages.init.dental.surface.chart.jaws import Chart
 from stages.init.dental.surface.grow import go_on_straight
 from stages.init.dental.template import textbook_arch

@@ -53,28 +53,23 @@ def test_a_chart_is_bent_out_of_the_void_and_no_further() -> None:
     weight[:, :60] = 1  # matched, at offset 0
     void = np.zeros((48, 160, len(OFFSETS)), bool)
     void[:, 100:, OFFSETS > -2] = True
-    offset = np.zeros_like(weight)
+    smooth = np.zeros_like(weight), weight, 5.0, 0.001, 0.6
 
-    def fit(held: np.ndarray | None, target: np.ndarray | None) -> np.ndarray:
-        return fit_offsets(offset, weight, 5.0, 0.001, 0.6, held, target)
-
-    assert np.abs(fit(None, None)).max() < 1e-6
-    fitted = carved(fit, void, OFFSETS)
+    assert np.abs(fit_offsets(*smooth)).max() < 1e-6
+    fitted = carved(*smooth, void, OFFSETS)
     assert np.abs(fitted[:, :40]).max() < 0.1
     assert fitted[:, 110:].max() < -1.8
     assert fitted[:, 110:].min() > -3.0
     # nothing to keep out of: the plain fit
-    np.testing.assert_array_equal(carved(fit, np.zeros_like(void), OFFSETS), fit(None, None))
+    plain = carved(*smooth, np.zeros_like(void), OFFSETS)
+    np.testing.assert_array_equal(plain, fit_offsets(*smooth))
 
 
 def test_a_chart_stays_where_every_offset_is_ruled_out() -> None:
     weight = np.ones((24, 40), np.float32)
-
-    def fit(held: np.ndarray | None, target: np.ndarray | None) -> np.ndarray:
-        return fit_offsets(np.full_like(weight, 0.5), weight, 5.0, 0.001, 0.6, held, target)
-
+    smooth = np.full_like(weight, 0.5), weight, 5.0, 0.001, 0.6
     everywhere = np.ones((24, 40, len(OFFSETS)), bool)
-    np.testing.assert_array_equal(carved(fit, everywhere, OFFSETS), fit(None, None))
+    np.testing.assert_array_equal(carved(*smooth, everywhere, OFFSETS), fit_offsets(*smooth))
 
 
 def test_the_bend_that_agrees_best_is_chosen_and_passed_on_to_where_nothing_agrees() -> None:

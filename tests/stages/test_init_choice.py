@@ -103,7 +103,7 @@ def test_teeth_are_tried_where_features_place_hardly_any_of_the_mouth(tmp_path, 
         monkeypatch.setattr(Placement, "normalised", lambda self: self)
         monkeypatch.setattr("stages.init.place.place_classical", lambda *_, **__: placement)
 
-    monkeypatch.setattr("stages.init.write.densify", lambda *_: densified.append(1))
+    monkeypatch.setattr("stages.init.densify.densify", lambda *_: densified.append(1))
     monkeypatch.setattr(
         "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
@@ -133,7 +133,7 @@ def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_pa
     """Of what small copies say: the attempt by features takes longer than all else."""
     order = []
     monkeypatch.setattr(Placement, "normalised", lambda self: self)
-    monkeypatch.setattr("stages.init.write.densify", lambda *_: order.append("dense"))
+    monkeypatch.setattr("stages.init.densify.densify", lambda *_: order.append("dense"))
 
     def by_features(views, *_, **__):
         order.append("features")

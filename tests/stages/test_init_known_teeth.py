@@ -65,7 +65,8 @@ def run(tmp_path, monkeypatch, path, found, likely=True, **settings):
     def sweep(*_, **__):
         raise ReconstructionError("the sweep was asked")
 
-    monkeypatch.setattr(place_known, "reconstruct_teeth", reconstruct)
+    monkeypatch.setattr(place_known, "place_teeth", reconstruct)
+    monkeypatch.setattr(place_known, "with_surface", lambda teeth, *_: teeth)
     monkeypatch.setattr("stages.init.place.place_known", sweep)
     config = InitConfig(cameras=str(path), **settings)
     inputs = {"views": photographs()} | ({"teeth": read_teeth()} if likely else {})

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import said_by_cameras
 from pipeline.artifacts.teeth import Dentition
-from pipeline.artifacts.views import Views
+from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
@@ -32,8 +33,15 @@ from stages.init.dental.place import (
     tooth_counts,
 )
 from stages.init.dental.read import labelled_teeth
-from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
-from stages.init.dental.surface.options import SweepRound
+from stages.init.dental.reconstruct import (
+    PlacedTeeth,
+    Reconstruction,
+    place_teeth,
+    with_surface,
+)
+from stages.init.dental.solution import ArchFit
+from stages.init.dental.surface.dense import SurfaceView
+from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement
 from stages.init.write import save_all
@@ -41,6 +49,7 @@ from stages.stereo import DenseOptions, DenseView
 from stages.stereo.reconstruct import complete_depths
 
 Array = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
 
 #: With cameras that are exact the gum can be followed this far beyond the crowns (mm), and what
 #: photographs agree on there is believed as it is on the crowns.
@@ -61,27 +70,6 @@ LEAST_FACING, GUM_DEVIATIONS = 0.2, 5.0
 GUESS = float(np.log((FILLED + MEASURED) / 2 - 1))
 
 
-def neighbour_angle(cameras: list[Camera]) -> float:
-    """Median over the cameras of the angle to the nearest other one, in degrees.
-
-    Seen from the point that is nearest to all optical axes; 0 where all look the same way.
-    """
-    if len(cameras) < 2:
-        return 0.0
-    ahead = np.stack([camera.rotation[2] for camera in cameras])
-    centres = np.stack([camera.centre for camera in cameras])
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    system = across.sum(0)
-    if np.linalg.cond(system) > 1e6:
-        return 0.0
-    target = np.linalg.solve(system, np.einsum("vij,vj->i", across, centres))
-    lines = centres - target
-    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-12)
-    cosine = np.clip(lines @ lines.T, -1, 1)
-    np.fill_diagonal(cosine, -1)
-    return float(np.median(np.degrees(np.arccos(cosine.max(axis=1)))))
-
-
 def from_known_teeth(
     context: StageContext, views: Views, known: dict[str, KnownCamera], units: str
 ) -> None:
@@ -100,49 +88,89 @@ def from_known_teeth(
         as_pinhole(view, known[view.name], CAMERAS) for view in views.views if view.name in known
     ]
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
-    centred = [centre_view(view, camera) for view, camera in pairs]
-    names = [photo_name(view) for view in placed]
-    arch = arch_options(config.dental, replace(views, views=tuple(placed)))
     by_name = labelled_teeth(context, views).by_name()
-    if turned := [photo_name(view) for view, _ in pairs if _mirrored(by_name.get(view.name))]:
+    if turned := [photo_name(view) for view in placed if _mirrored(by_name.get(view.name))]:
         raise RequestError(
             f"{', '.join(turned)} {'is' if len(turned) == 1 else 'are'} said to be mirrored, but "
             "init.cameras gives a camera for the picture as it is. Take `mirrored` out of the "
             "corrections, or leave init.cameras out."
         )
-    chosen = [
-        moved(by_name[view.name], found)
-        if view.name in by_name and by_name[view.name].all_crowns
-        else None
-        for (view, _), found in zip(pairs, centred, strict=True)
-    ]
-    surface = replace(
-        surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
-        least_facing=LEAST_FACING, least_showing=LEAST_FACING / 2, gum_deviations=GUM_DEVIATIONS,
-        carve=True, past_row=None, only_clear=False,
+    posed = replace(views, views=tuple(placed))
+    held = held_teeth(context, posed, cameras)
+    # with cameras that are exact the charts may go on as far as they are
+    teeth = with_surface(
+        held.placed(context, posed, cameras, config.dental.accept_doubtful),
+        replace(held.surface, past_row=None), context.threads, context.progress,
     )  # fmt: skip
-    if config.dental.gum_height is None:
-        surface = replace(surface, gum_height=GUM_HEIGHT)
-    teeth = reconstruct_teeth(
-        [found.view for found in centred], names, chosen, [found.focal for found in centred],
-        arch, surface, accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
-        progress=context.progress, cameras=[camera.cam_from_world for camera in cameras],
-        scales=[working_scale(view.width, view.height) for view in placed],
-    )  # fmt: skip
-    without = [name for name, view in zip(names, teeth.fit.views, strict=True) if view is None]
-    if without:
-        raise ReconstructionError(
-            f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
-        )
     for doubt in (*teeth.fit.doubts, *numbered_otherwise(teeth, config.dental.min_margin)):
         context.warn(doubt)
     left_out = [photo_name(view) for view in views.views if view.name not in known]
     if left_out:
         context.warn(f"The model has no camera of {', '.join(left_out)}; left out.")
-    _write(context, views, teeth, centred, Placement(
+    _write(context, views, teeth, held.centred, Placement(
         views=tuple(placed), cameras=tuple(cameras), points=np.zeros((0, 3)), seen=(), weights={},
         scale=said_by_cameras(units), given=True,
     ))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class HeldTeeth:
+    """Photographs before cameras that stay, as `place_teeth` takes them.
+
+    Attributes:
+        centred: the photographs with the principal point in the middle.
+        names: how the user knows them.
+        dentitions: the crowns of each, in pixels of `centred`; None: it shows none.
+        surface: settings of a surface where cameras are right.
+    """
+
+    centred: list[CentredView]
+    names: list[str]
+    dentitions: list[Dentition | None]
+    surface: SurfaceOptions
+
+    def placed(
+        self, context: StageContext, views: Views, cameras: Sequence[Camera], accept_doubtful: bool
+    ) -> PlacedTeeth:
+        """Which tooth is which before these cameras, of these photographs.
+
+        Raises:
+            ReconstructionError: no teeth, or they are doubtful, or don't fit the cameras.
+        """
+        teeth = place_teeth(
+            [found.view for found in self.centred], self.names, self.dentitions,
+            [found.focal for found in self.centred], arch_options(context.config.dental, views),
+            accept_doubtful=accept_doubtful, threads=context.threads, progress=context.progress,
+            cameras=[camera.cam_from_world for camera in cameras],
+            scales=[working_scale(view.width, view.height) for view in views.views],
+        )  # fmt: skip
+        placed = zip(self.names, teeth.fit.views, strict=True)
+        if without := [name for name, view in placed if view is None]:
+            raise ReconstructionError(
+                f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
+            )
+        return teeth
+
+
+def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -> HeldTeeth:
+    """The teeth that were read in photographs whose cameras stay."""
+    config: InitConfig = context.config
+    by_name = labelled_teeth(context, views).by_name()
+    centred = [centre_view(view, camera) for view, camera in zip(views.views, cameras, strict=True)]
+    dentitions = [
+        moved(by_name[view.name], found)
+        if view.name in by_name and by_name[view.name].all_crowns
+        else None
+        for view, found in zip(views.views, centred, strict=True)
+    ]
+    surface = replace(
+        surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
+        least_facing=LEAST_FACING, least_showing=LEAST_FACING / 2, gum_deviations=GUM_DEVIATIONS,
+        carve=True, only_clear=False,
+    )  # fmt: skip
+    if config.dental.gum_height is None:
+        surface = replace(surface, gum_height=GUM_HEIGHT)
+    return HeldTeeth(centred, [photo_name(view) for view in views.views], dentitions, surface)
 
 
 def _mirrored(dentition: Dentition | None) -> bool:
@@ -168,18 +196,14 @@ def _write(
 ) -> None:  # fmt: skip
     config: InitConfig = context.config
     surface = teeth.surface
-    # The arch's frame lies before the cameras as the fit has put it.
-    arch_cameras = [
-        replace(camera, cam_from_world=found.cam_from_world)
-        for camera, found in zip(placement.cameras, teeth.fit.views, strict=True)
-        if found is not None
-    ]
-    scale, turn, shift = similarity_between(arch_cameras, placement.cameras)
+    scale, turn, shift = world_from_arch(teeth.fit, placement.cameras)
     positions = scale * surface.positions.astype(np.float64) @ turn.T + shift
     placement = replace(placement, points=positions).normalised()
     cameras = placement.cameras
-    scale, turn, _ = similarity_between(arch_cameras, cameras)
-    dense = _completed(context, teeth, centred, placement, scale, turn)
+    scale, turn, _ = world_from_arch(teeth.fit, cameras)
+    dense = _completed(
+        context, as_seen(surface.views, centred, placement.views, scale, turn), placement
+    )
     masks = config.dental.mask_rest is True  # unlike with estimated cameras, not by default
     points = Points(
         positions=placement.points.astype(np.float32),
@@ -219,29 +243,56 @@ def _write(
     context.summarize(dense="teeth", dense_points=len(points), **tooth_counts(teeth))
 
 
-def _completed(
-    context: StageContext, teeth: Reconstruction, centred: list[CentredView], placement: Placement,
+def world_from_arch(fit: ArchFit, cameras: Sequence[Camera]) -> tuple[float, Array, Array]:
+    """Scale, rotation and shift by which the arch lies before the cameras as the fit has put it."""
+    arch_cameras = [
+        replace(camera, cam_from_world=found.cam_from_world)
+        for camera, found in zip(cameras, fit.views, strict=True)
+        if found is not None
+    ]
+    return similarity_between(arch_cameras, cameras)
+
+
+def as_seen(
+    surface: Sequence[SurfaceView | None], centred: Sequence[CentredView], views: Sequence[View],
     scale: float, turn: Array,
-) -> list[DenseView]:  # fmt: skip
-    """The surface as each photograph sees it, in units of the cameras, and what lies around it."""
-    config: InitConfig = context.config
-    depths, confidences, normals = [], [], []
-    for found, there, view in zip(teeth.surface.views, centred, placement.views, strict=True):
+) -> list[SurfaceView]:  # fmt: skip
+    """The surface as each photograph sees it, in units and directions of the cameras.
+
+    Args:
+        surface: of each photograph as it was centred, none of them None.
+        centred, views: of each.
+        scale, turn: of `world_from_arch`.
+    """
+    seen = []
+    for found, there, view in zip(surface, centred, views, strict=True):
         assert found is not None
         size = view.width, view.height
         known = there.back(found.depth, *size) * np.float32(scale)
-        depths.append(np.where(view.valid(), known, 0).astype(np.float32))
-        confidences.append(there.back(found.confidence, *size))
-        normals.append(there.back(found.normal, *size) @ turn.T.astype(np.float32))
-    options = DenseOptions(**{**config.dense.model_dump(), "method": "sweep"})
+        seen.append(SurfaceView(
+            depth=np.where(view.valid(), known, 0).astype(np.float32),
+            normal=there.back(found.normal, *size) @ turn.T.astype(np.float32),
+            confidence=there.back(found.confidence, *size),
+        ))  # fmt: skip
+    return seen
+
+
+def _completed(
+    context: StageContext, seen: list[SurfaceView], placement: Placement
+) -> list[DenseView]:
+    """The surface as each photograph sees it, and what lies around it."""
+    options = DenseOptions(**{**context.config.dense.model_dump(), "method": "sweep"})
     dense = complete_depths(
         [view.image for view in placement.views], [view.valid() for view in placement.views],
-        list(placement.cameras), depths, confidences, options, context.threads,
+        list(placement.cameras), [there.depth for there in seen],
+        [there.confidence for there in seen], options, context.threads,
     )  # fmt: skip
     return [
         replace(
             view,
-            normal=np.where((view.depth > 0)[..., None], normal, view.normal).astype(np.float32),
+            normal=np.where((view.depth > 0)[..., None], there.normal, view.normal).astype(
+                np.float32
+            ),
         )
-        for view, normal in zip(dense, normals, strict=True)
+        for view, there in zip(dense, seen, strict=True)
     ]

@@ -58,6 +58,25 @@ class Reconstruction:
     pictures: Mapping[str, Picture] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class PlacedTeeth:
+    """Numbered teeth before their cameras.
+
+    Attributes:
+        views, dentitions, fit: as of `Reconstruction`.
+        small: all that at the size that was worked at.
+        full: the photographs as they are, for depths and colours.
+        pictures: the labelled photographs.
+    """
+
+    views: list[View]
+    dentitions: list[Dentition | None]
+    fit: ArchFit
+    small: Turned
+    full: list[FullSize | None]
+    pictures: dict[str, Picture]
+
+
 def reconstruct_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
@@ -81,6 +100,23 @@ def reconstruct_teeth(
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
             with it, and the teeth with their numbers, so that the user can put them right.
+    """
+    teeth = place_teeth(
+        views, names, dentitions, focals, arch, accept_doubtful=accept_doubtful, threads=threads,
+        progress=progress, cameras=cameras, scales=scales,
+    )  # fmt: skip
+    return with_surface(teeth, surface, threads, progress)
+
+
+def place_teeth(
+    views: list[View], names: list[str], dentitions: list[Dentition | None],
+    focals: list[float | None], arch: ArchOptions, *, accept_doubtful: bool, threads: int,
+    progress: Progress, cameras: list[Array] | None, scales: list[float] | None,
+) -> PlacedTeeth:  # fmt: skip
+    """Say which tooth is which, and place the cameras; arguments as for `reconstruct_teeth`.
+
+    Raises:
+        ReconstructionError: no teeth, or the result is doubtful.
     """
     found = sum(dentition is not None for dentition in dentitions)
     if found < (2 if accept_doubtful or cameras is not None else LEAST_PHOTOGRAPHS):
@@ -129,12 +165,22 @@ def reconstruct_teeth(
         FullSize(view.image, view.valid(), d.mask, d.above) if d else None
         for view, d in zip(views, numbered, strict=True)
     ]
+    return PlacedTeeth(views, numbered, fit, turned, full, pictures)
+
+
+def with_surface(
+    teeth: PlacedTeeth, surface: SurfaceOptions, threads: int, progress: Progress
+) -> Reconstruction:
+    """The teeth with their dense surface."""
+    small = teeth.small
     dense = dense_surface(
-        [view.image for view in turned.views], [view.valid() for view in turned.views],
-        turned.dentitions, turned.fit, surface, threads, progress, full,
+        [view.image for view in small.views], [view.valid() for view in small.views],
+        small.dentitions, small.fit, surface, threads, progress, teeth.full,
     )  # fmt: skip
-    pictures["turned"] = turned_sheet(dense)
-    return Reconstruction(views, numbered, fit, dense, turned.mirrored, pictures)
+    pictures = {**teeth.pictures, "turned": turned_sheet(dense)}
+    return Reconstruction(
+        teeth.views, teeth.dentitions, teeth.fit, dense, small.mirrored, pictures
+    )  # fmt: skip
 
 
 def _resized(dentition: Dentition | None, view: View) -> Dentition | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -53,6 +54,13 @@ class CentredView:
         columns = np.clip(np.rint(x).astype(np.int64), 0, values.shape[1] - 1)
         rows = np.clip(np.rint(y).astype(np.int64), 0, values.shape[0] - 1)
         return np.ascontiguousarray(values[np.ix_(rows, columns)])
+
+    def forth(self, values: Map) -> Map:
+        """A map [H, W] of the photograph on the centred one, 0 beyond it: the nearest as well."""
+        size = self.view.width, self.view.height
+        affine = self.centred_from_view.copy()
+        affine[:2, 2] += np.diag(affine)[:2] / 2 - 0.5  # OpenCV has pixel centres at 0
+        return np.asarray(cv2.warpAffine(values, affine[:2], size, flags=cv2.INTER_NEAREST))
 
 
 def centre_view(view: View, camera: Camera) -> CentredView:

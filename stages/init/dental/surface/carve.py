@@ -6,13 +6,12 @@ beside them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 from numba import prange
 
 from pipeline.kernels import kernel
+from stages.init.dental.surface.fit import fit_offsets, reweighted
 from stages.init.dental.surface.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
@@ -80,31 +79,37 @@ def _nearest_outside(void, plane, target):  # type: ignore[no-untyped-def]
 
 
 def carved(
-    fit: Callable[[Array32 | None, Array32 | None], Array32], void: Mask, offsets: Array32
-) -> Array32:
-    """Fit a smooth field of offsets that keeps out of the void.
+    offset: Array32, weight: Array32, stiffness: float, anchor: float, outlier: float, void: Mask,
+    steps: Array32,
+) -> Array32:  # fmt: skip
+    """Fit a smooth field to offsets, as `fit_offsets`, that keeps out of the void.
 
     What lies inside is held at the nearest offset outside, and the field fitted again, until all of
-    it is outside or some rounds are over.
+    it is outside or some rounds are over. Which offsets are wrong is decided before.
 
     Args:
-        fit: offsets [H, W] float32 of weights [H, W] and targets [H, W] to hold them at.
+        offset, weight, stiffness, anchor, outlier: of `fit_offsets`.
         void: [H, W, D] bool.
-        offsets: [D] float32, evenly spaced.
+        steps: [D] float32 its offsets, evenly spaced.
     """
-    fitted = fit(None, None)
+    fitted = fit_offsets(offset, weight, stiffness, anchor, outlier)
+    trust = reweighted(offset, weight, fitted, outlier)
     held, target = np.zeros_like(fitted), np.zeros_like(fitted)
     nearest = np.empty(fitted.shape, np.int64)
-    step = offsets[1] - offsets[0]
+    step = steps[1] - steps[0]
     for _ in range(_ROUNDS):
-        plane = np.rint((fitted - offsets[0]) / step).astype(np.int64)
-        plane = np.clip(plane, 0, len(offsets) - 1)
+        plane = np.rint((fitted - steps[0]) / step).astype(np.int64)
+        plane = np.clip(plane, 0, len(steps) - 1)
         inside = np.take_along_axis(void, plane[..., None], 2)[..., 0]
         if not inside.any():
             break
         _nearest_outside(void, plane, nearest)
         inside &= nearest >= 0
+        if not inside.any():
+            break
         held[inside] = _HOLD
-        target[inside] = offsets[nearest[inside]]
-        fitted = fit(held, target)
+        target[inside] = steps[nearest[inside]]
+        fitted = fit_offsets(
+            offset, trust, stiffness, anchor, outlier, held, target, reweightings=0
+        )  # fmt: skip
     return fitted

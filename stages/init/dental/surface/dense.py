@@ -34,6 +34,7 @@ from stages.init.dental.surface.cloud import coloured_cloud
 from stages.init.dental.surface.cover import uncovered
 from stages.init.dental.surface.ends import within_rows
 from stages.init.dental.surface.grow import grow_gum
+from stages.init.dental.surface.measured import bend_to
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
 from stages.init.dental.surface.sweep import choose_pairs, sweep
@@ -114,32 +115,91 @@ def dense_surface(
         ValueError: lists of different length, sizes that don't agree, or no placed photograph.
     """
     options = options or SurfaceOptions()
+    _check_lengths(images, valid, dentitions, fit)
+    steps = 3 + len(options.rounds)
+    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
+        progress("photographs", 0, steps)
+        photos, charts, middle = _start(images, valid, dentitions, fit, options, threads)
+        pairs = choose_pairs(photos, middle, options)
+        near = replace(options, gum_height=min(options.gum_height, options.grow_from))
+        for number, settings in enumerate(options.rounds if pairs else ()):
+            progress("sweep", 2 + number, steps)
+            _sweep(charts, photos, pairs, settings, near, threads)
+        if pairs and options.rounds and options.gum_height > options.grow_from:
+            grow_gum(charts, photos, pairs, options, threads)
+            _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
+        progress("colour", steps - 1, steps)
+        looked = _look_at(charts, photos, full, options, threads)
+        cloud = coloured_cloud(
+            charts, looked.photos, looked.shown, looked.nearest, _anchor(photos, fit), options,
+            threads,
+        )  # fmt: skip
+        progress("colour", steps, steps)
+    gains = np.ones((len(images), 3))
+    for photo, gain in zip(photos, cloud.gains, strict=True):
+        gains[photo.index] = gain
+    return ArchSurface(
+        views=looked.views_of(len(images)),
+        positions=cloud.positions,
+        colors=cloud.colors,
+        normals=cloud.normals,
+        confidence=cloud.confidence,
+        tooth=cloud.tooth,
+        faces=cloud.faces,
+        gains=gains,
+    )
+
+
+def completed_surface(
+    images: list[Array32],
+    valid: list[Mask],
+    dentitions: list[Dentition | None],
+    fit: ArchFit,
+    depths: list[Array32],
+    options: SurfaceOptions,
+    threads: int,
+    full: Sequence[FullSize | None],
+) -> tuple[SurfaceView | None, ...]:
+    """Crowns and gum as they go on from depth that is measured, seen from each photograph.
+
+    Args:
+        images, valid, dentitions, fit, options, threads, full: as for `dense_surface`.
+        depths: [H, W] float32 z-depth of each image in mm, 0 where unknown.
+
+    Raises:
+        ValueError: as `dense_surface`.
+        ReconstructionError: what is measured lies elsewhere than the crowns.
+    """
+    _check_lengths(images, valid, dentitions, fit)
+    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
+        photos, charts, _ = _start(images, valid, dentitions, fit, options, threads)
+        bend_to(charts, photos, [depths[photo.index] for photo in photos], options)
+        return _look_at(charts, photos, full, options, threads).views_of(len(images))
+
+
+def _check_lengths(
+    images: list[Array32], valid: list[Mask], dentitions: list[Dentition | None], fit: ArchFit
+) -> None:
     if not len(images) == len(valid) == len(dentitions) == len(fit.views):
         raise ValueError(
-            f"dense_surface needs one image, mask, dentition and camera per photograph, not "
+            f"the surface needs one image, mask, dentition and camera per photograph, not "
             f"{len(images)}, {len(valid)}, {len(dentitions)} and {len(fit.views)}"
         )
-    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
-        return _dense_surface(images, valid, dentitions, fit, options, threads, progress, full)
 
 
-def _dense_surface(
+def _start(
     images: list[Array32],
     valid: list[Mask],
     dentitions: list[Dentition | None],
     fit: ArchFit,
     options: SurfaceOptions,
     threads: int,
-    progress: Progress,
-    full: Sequence[FullSize | None],
-) -> ArchSurface:
-    steps = 3 + len(options.rounds)
-    progress("photographs", 0, steps)
+) -> tuple[list[Photo], list[Chart], Array64]:
+    """The photographs prepared, the charts as the crown shapes have them, and their middle [3]."""
     if not fit.shape:
         raise ValueError("the arch has no landmarks, so that there is no surface to make")
     middle = np.mean([fit.shape[mark] for mark in sorted(fit.shape)], axis=0)
     photos = _prepare(images, valid, dentitions, fit, middle, options, threads)
-    progress("crown shapes", 1, steps)
     jaws: tuple[Jaw, ...] = ("upper", "lower")
     charts = [chart for jaw in jaws if (chart := start_chart(jaw, fit, options))]
     if not photos or not charts:
@@ -147,23 +207,48 @@ def _dense_surface(
             "no photograph was placed with a named tooth, so that there is no surface to make; see "
             "the labelled overlay of the crowns and pass --set init.dental.order or FDI hints"
         )
-    pairs = choose_pairs(photos, middle, options)
-    near = replace(options, gum_height=min(options.gum_height, options.grow_from))
-    for number, settings in enumerate(options.rounds if pairs else ()):
-        progress("sweep", 2 + number, steps)
-        _sweep(charts, photos, pairs, settings, near, threads)
-    if pairs and options.rounds and options.gum_height > options.grow_from:
-        grow_gum(charts, photos, pairs, options, threads)
-        _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
+    return photos, charts, middle
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """The finished charts, looked at.
+
+    Attributes:
+        photos: what is tooth and gum in each photograph, at the size that was worked at.
+        shown: the same at the size that depths and colours are wanted in.
+        nearest: per photograph the z-depth [h, w] of the nearest chart.
+        looks: the surface in each of `shown`.
+    """
+
+    photos: list[Photo]
+    shown: list[Photo]
+    nearest: list[Array32]
+    looks: list[SurfaceView]
+
+    def views_of(self, count: int) -> tuple[SurfaceView | None, ...]:
+        """One per photograph of so many, None where it was not placed."""
+        views: list[SurfaceView | None] = [None] * count
+        for photo, look in zip(self.photos, self.looks, strict=True):
+            views[photo.index] = look
+        return tuple(views)
+
+
+def _look_at(
+    charts: list[Chart],
+    photos: list[Photo],
+    full: Sequence[FullSize | None],
+    options: SurfaceOptions,
+    threads: int,
+) -> _Looked:
+    """What each photograph sees of the charts; their agreement is smoothed on the way."""
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
     photos = uncovered(charts, photos, nearest, options, threads)
     photos = within_rows(charts, photos, nearest, options, threads)
-    progress("colour", steps - 1, steps)
     for chart in charts:
         sigma = _AGREEMENT_SMOOTHING * chart.grid.density
         smooth = cv2.GaussianBlur(chart.agreement, (0, 0), sigma)
         chart.agreement = np.asarray(smooth, np.float32)
-    views: list[SurfaceView | None] = [None] * len(images)
     shown = [
         at_full_size(photo, whole) if full and (whole := full[photo.index]) else photo
         for photo in photos
@@ -173,22 +258,7 @@ def _dense_surface(
         for chart in charts
     ]
     looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
-    gains = np.ones((len(images), 3))
-    anchor = _anchor(photos, fit)
-    cloud = coloured_cloud(charts, photos, shown, nearest, anchor, options, threads)
-    for photo, view, gain in zip(photos, looks, cloud.gains, strict=True):
-        views[photo.index], gains[photo.index] = view, gain
-    progress("colour", steps, steps)
-    return ArchSurface(
-        views=tuple(views),
-        positions=cloud.positions,
-        colors=cloud.colors,
-        normals=cloud.normals,
-        confidence=cloud.confidence,
-        tooth=cloud.tooth,
-        faces=cloud.faces,
-        gains=gains,
-    )
+    return _Looked(photos, shown, nearest, looks)
 
 
 def _sweep(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +16,8 @@ Array32 = npt.NDArray[np.float32]
 #: The field is solved for on a grid so many times coarser than the chart (half a mm at the default
 #: density), where stiffness is counted.
 _COARSER = 4
-_REWEIGHTINGS = 3
+#: Rounds in which offsets that stand out lose weight.
+REWEIGHTINGS = 3
 
 
 def fit_offsets(
@@ -25,6 +28,7 @@ def fit_offsets(
     outlier: float,
     held: Array32 | None = None,
     target: Array32 | None = None,
+    reweightings: int = REWEIGHTINGS,
 ) -> Array32:
     """Minimise sum w (x - o)^2 + h (x - t)^2 + stiffness |D2 x|^2 + anchor x^2, robustly.
 
@@ -40,6 +44,7 @@ def fit_offsets(
         outlier: scale of the reweighting, in the units of the offset.
         held, target: [H, W] float32 weight >= 0 and offset t of what is no measurement, and never
             an outlier.
+        reweightings: how often weights are found anew.
 
     Returns:
         [H, W] float32.
@@ -47,14 +52,14 @@ def fit_offsets(
     rows, cols = (max(n // _COARSER, 3) for n in offset.shape)
     size = (cols, rows)
     shape = (offset.shape[1], offset.shape[0])
-    plate = _plate(cols, rows, stiffness)
+    plate = _plate(cols, rows, float(stiffness))
     trust = weight
     fitted = np.zeros_like(offset)
     with threadpool_limits(limits=1):
-        for step in range(_REWEIGHTINGS + 1):
+        for step in range(reweightings + 1):
             # Sample by sample: once averaged over a cell, an outlier can't be told any more.
             if step:
-                trust = weight / (1 + ((fitted - offset) / np.float32(outlier)) ** 2)
+                trust = reweighted(offset, weight, fitted, outlier)
             # Columns one after the other: the chart is wide, so that the band is narrow.
             total, moment = trust, trust * offset
             if held is not None and target is not None:
@@ -69,13 +74,22 @@ def fit_offsets(
     return np.asarray(fitted, np.float32)
 
 
+def reweighted(offset: Array32, weight: Array32, fitted: Array32, outlier: float) -> Array32:
+    """The weights [H, W] that offsets keep beside a field that was fitted to them."""
+    return np.asarray(weight / (1 + ((fitted - offset) / np.float32(outlier)) ** 2), np.float32)
+
+
 def _reduced(values: Array32, size: tuple[int, int]) -> npt.NDArray[np.float64]:
     """Means over the cells of a coarser grid (columns, rows)."""
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float64)
 
 
+@lru_cache(maxsize=8)
 def _plate(slow: int, fast: int, stiffness: float) -> npt.NDArray[np.float64]:
-    """[2 fast + 1, slow * fast] lower band of the thin plate's matrix on a grid (slow, fast)."""
+    """[2 fast + 1, slow * fast] lower band of the thin plate's matrix on a grid (slow, fast).
+
+    Not to be changed: it is kept.
+    """
 
     def second(n: int) -> sparse.csr_matrix:
         return sparse.diags_array(

@@ -227,18 +227,13 @@ def sweep(
     """
     found = match(grid, radius, photos, seen, pairs, trust, settings, options)
 
-    def fit(held: Array32 | None, target: Array32 | None) -> Array32:
-        return fit_offsets(
-            found.offset, found.weight, settings.stiffness, options.anchor, options.outlier,
-            held, target,
-        )  # fmt: skip
-
+    smooth = found.offset, found.weight, settings.stiffness, options.anchor, options.outlier
     if options.carve:
         unmatched = used & (found.weight < _NO_AGREEMENT)
         void = in_void(found.points, found.normals, found.offsets, photos) & unmatched[..., None]
-        fitted = carved(fit, void, found.offsets)
+        fitted = carved(*smooth, void, found.offsets)
     else:
-        fitted = fit(None, None)
+        fitted = fit_offsets(*smooth)
     return Evidence(grid.radius_of(found.points + fitted[..., None] * found.normals), found.weight)
 
 

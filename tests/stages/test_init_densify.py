@@ -1,0 +1,127 @@
+"""When depth is completed by the shape of teeth, and what of it is used."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.confidence import FILLED
+from pipeline.errors import ReconstructionError
+from pipeline.stage import LocalContext
+from stages.init import densify
+from stages.init.config import InitConfig
+from stages.init.dental.reconstruct import PlacedTeeth
+from stages.stereo import DenseView
+from tests.stages.init_teeth_case import (
+    FOCAL,
+    SIZE,
+    found_teeth,
+    photographs,
+    read_teeth,
+    side_pose,
+)
+
+UNIT = 0.02  # of the cameras' world per mm of the arch
+
+
+def context(tmp_path, teeth=None, **settings):
+    inputs = {"views": photographs()} | ({"teeth": teeth} if teeth else {})
+    return LocalContext(InitConfig(**settings), tmp_path, inputs=inputs, threads=1)
+
+
+@pytest.mark.parametrize(
+    ("count", "teeth", "settings", "expected"),
+    [
+        (3, read_teeth(), {}, True),
+        (3, None, {}, False),
+        (4, read_teeth(4), {}, False),
+        (2, read_teeth(2), {}, False),
+        (3, read_teeth(2), {}, False),
+        (3, read_teeth(), {"dental": {"order": ("right", "left")}}, False),
+        (3, read_teeth(), {"dental": {"order": ("right", "frontal", "left")}}, True),
+    ],
+    ids=["three", "no teeth", "four", "two", "one without", "other order", "order"],
+)
+def test_three_photographs_of_teeth_are_completed(tmp_path, count, teeth, settings, expected):
+    asked = context(tmp_path, teeth, **settings)
+    assert densify.few_of_teeth(asked, photographs(count)) is expected
+
+
+def cameras():
+    """Those of the arch frame, in a world of another unit."""
+    placed = []
+    for k, yaw in enumerate((-40, 0, 40)):
+        pose = side_pose(yaw)
+        pose[:3, 3] *= UNIT
+        placed.append(
+            Camera(f"{k:03d}", SIZE[1], SIZE[0], FOCAL, FOCAL, SIZE[1] / 2, SIZE[0] / 2, pose)
+        )
+    return placed
+
+
+def stereo(known):
+    """Depth of a wall where `known` [H, W]."""
+    nothing = np.zeros(SIZE, np.float32)
+    depth = np.where(known, np.float32(3), nothing)
+    sure = np.where(known, np.float32(7), np.float32(1))
+    return [DenseView(depth, sure, np.zeros((*SIZE, 3), np.float32), nothing) for _ in range(3)]
+
+
+def ball_before_the_cameras(monkeypatch):
+    """Teeth whose surface is a ball, whatever is measured; what was measured."""
+    found, asked = found_teeth(), {}
+
+    def place(views, *_, **__):
+        small = type("Small", (), {
+            "views": views, "dentitions": found.dentitions, "fit": found.fit,
+        })  # fmt: skip
+        return PlacedTeeth(views, found.dentitions, found.fit, small, [], {})
+
+    def surface(images, valid, dentitions, fit, depths, *_):
+        asked["depths"] = depths
+        return found.surface.views
+
+    monkeypatch.setattr("stages.init.dental.place_known.place_teeth", place)
+    monkeypatch.setattr(densify, "completed_surface", surface)
+    return found, asked
+
+
+def test_what_is_measured_stays_and_crowns_fill_the_rest(tmp_path, monkeypatch):
+    found, asked = ball_before_the_cameras(monkeypatch)
+    known = np.zeros(SIZE, bool)
+    known[:, :40] = True
+    dense = stereo(known)
+    result = densify.completed_by_teeth(
+        context(tmp_path, read_teeth()), photographs(), cameras(), dense
+    )
+    for there, before, ball in zip(result, dense, found.surface.views, strict=True):
+        np.testing.assert_array_equal(there.depth[known], before.depth[known])
+        np.testing.assert_array_equal(there.confidence[known], 7)
+        rest = ~known
+        np.testing.assert_allclose(there.depth[rest], UNIT * ball.depth[rest], rtol=1e-5)
+        np.testing.assert_array_equal(
+            there.confidence[rest], np.where(ball.depth[rest] > 0, np.float32(FILLED), 1)
+        )
+    for depth in asked["depths"]:  # in mm of the arch
+        np.testing.assert_allclose(depth[known], 3 / UNIT, rtol=1e-5)
+        assert not depth[~known].any()
+
+
+def test_teeth_that_are_not_where_the_depth_is_complete_nothing(tmp_path, monkeypatch):
+    ball_before_the_cameras(monkeypatch)
+
+    def elsewhere(*_):
+        raise ReconstructionError("the crowns would lie elsewhere")
+
+    monkeypatch.setattr(densify, "completed_surface", elsewhere)
+    asked = context(tmp_path, read_teeth())
+    views = photographs()
+    assert densify.completed_by_teeth(asked, views, cameras(), stereo(np.ones(SIZE, bool))) is None
+    assert asked.warnings == []
+
+
+def test_mirror_images_are_not_completed(tmp_path):
+    teeth = read_teeth()
+    turned = replace(teeth, views=(replace(teeth.views[0], mirrored=True), *teeth.views[1:]))
+    assert not densify.few_of_teeth(context(tmp_path, turned), photographs())
