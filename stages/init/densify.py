@@ -102,9 +102,9 @@ def few_of_teeth(context: StageContext, views: Views) -> bool:
     order = context.config.dental.order
     if order is not None and len(order) != len(views):
         return False
-    read = labelled_teeth(context, views).by_name()
-    shown = [read.get(view.name) for view in views.views]
-    return all(found and found.all_crowns and not found.mirrored for found in shown)
+    chosen = labelled_teeth(context, views).chosen
+    shown = {found.name for found in chosen if found.all_crowns and not found.mirrored}
+    return shown >= {view.name for view in views.views}
 
 
 def completed_by_teeth(

@@ -38,10 +38,11 @@ def context(tmp_path, teeth=None, **settings):
         (4, read_teeth(4), {}, False),
         (2, read_teeth(2), {}, False),
         (3, read_teeth(2), {}, False),
+        (3, read_teeth(3, aside=(1,)), {}, False),
         (3, read_teeth(), {"dental": {"order": ("right", "left")}}, False),
         (3, read_teeth(), {"dental": {"order": ("right", "frontal", "left")}}, True),
     ],
-    ids=["three", "no teeth", "four", "two", "one without", "other order", "order"],
+    ids=["three", "no teeth", "four", "two", "one without", "set aside", "other order", "order"],
 )
 def test_three_photographs_of_teeth_are_completed(tmp_path, count, teeth, settings, expected):
     asked = context(tmp_path, teeth, **settings)
