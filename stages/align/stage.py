@@ -15,8 +15,8 @@ from pipeline.stage import Stage, StageConfig, StageContext
 if TYPE_CHECKING:
     from pipeline.artifacts.cameras import Camera, Cameras
 
-#: So few photographs, no further apart than this (degrees): what is completed counts like what is
-#: measured.
+#: So few photographs of a mouth, no further apart than this (degrees): what is completed counts
+#: like what is measured.
 FEW_VIEWS, NEAR = 5, 30.0
 
 
@@ -99,7 +99,7 @@ class AlignConfig(StageConfig):
     fill_confidence: Annotated[float, Field(ge=1)] | Literal["auto"] = Field(
         "auto",
         description="Depths of no more confidence count as fill: used where nothing better is. "
-        "auto: 1.25; 1, which is none, of up to 5 photographs near each other.",
+        "auto: 1.25; 1, which is none, of up to 5 photographs of a mouth near each other.",
     )  # fmt: skip
     fill_stride: int = Field(
         3, ge=1, le=64, description="Of the fill, one pixel in so many (in x and y) is taken."
@@ -240,17 +240,18 @@ def _fill_confidence(
 ) -> float:
     """What `fill_confidence: auto` comes to.
 
-    What few photographs show is to a good part completed. Between near ones that is seldom off by
-    much, and left out it is missed; between wide ones it gets in the way of what is right. From six
-    on it hardly matters.
+    What few photographs show of a mouth is to a good part completed. Between near ones that is
+    seldom off by much, and left out it is missed; between wide ones it gets in the way of what is
+    right. From six on it hardly matters, and elsewhere (a street) it gained nothing.
     """
     from pipeline.geometry.order import neighbour_angle
 
     if config.fill_confidence != "auto":
         return config.fill_confidence
-    found = given is not None and not given.provisional
+    if given is None or given.provisional or given.mouth_from_world is None:
+        return FILLED
     near = len(cameras) <= FEW_VIEWS and neighbour_angle(cameras) <= NEAR
-    return 1.0 if found and near else FILLED
+    return 1.0 if near else FILLED
 
 
 def _kept(context: StageContext) -> bool:

@@ -255,10 +255,11 @@ def test_what_is_completed_counts_in_full_between_few_near_photographs(
     cameras = turned((world[0] * 2)[:count], factor)
     if count > 4:  # no two in the same place
         cameras[4:] = turned(cameras[4:], 0.5)
-    given = Cameras(tuple(cameras), provisional=provisional)
+    given = Cameras(tuple(cameras), provisional=provisional, mouth_from_world=np.eye(4))
     config = AlignConfig(fill_confidence=setting)
     assert _fill_confidence(config, given, cameras) == expected
-    assert _fill_confidence(config, None, cameras) == (1.4 if setting == 1.4 else FILLED)
+    for other in (None, replace(given, mouth_from_world=None)):
+        assert _fill_confidence(config, other, cameras) == (1.4 if setting == 1.4 else FILLED)
 
 
 def test_highlights_do_not_colour_the_cloud(world):
