@@ -238,6 +238,11 @@ class DentalConfig(StageConfig):
         description="mask what is not teeth or gum: gloves, lips, retractors; null: unless "
         "init.cameras are given",
     )
+    complete_depth: bool = Field(
+        True,
+        description="where stereo measures three photographs of teeth, the shape of crowns "
+        "completes what it does not see",
+    )
     wide_angle: float = Field(
         30.0, ge=0, le=180,
         description="init.cameras given: where neighbouring views (3 to 12, of teeth) are further "

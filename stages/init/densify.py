@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
 from pipeline.artifacts.views import Views
-from pipeline.errors import ReconstructionError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
 from pipeline.geometry.graph import spanning_pairs
 from pipeline.stage import StageContext
@@ -96,11 +96,11 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
 
 
 def few_of_teeth(context: StageContext, views: Views) -> bool:
-    """Are these three photographs, and all of teeth?"""
-    if not context.has("teeth") or len(views) != COMPLETED_VIEWS:
-        return False
-    order = context.config.dental.order
-    if order is not None and len(order) != len(views):
+    """Are these three photographs, all of teeth, that are to be completed by them?"""
+    config: InitConfig = context.config
+    if not (
+        config.dental.complete_depth and context.has("teeth") and len(views) == COMPLETED_VIEWS
+    ):
         return False
     chosen = labelled_teeth(context, views).chosen
     shown = {found.name for found in chosen if found.all_crowns and not found.mirrored}
@@ -119,7 +119,8 @@ def completed_by_teeth(
 
     Returns:
         Each with more depth and its confidence, for `complete_depths`; None where the teeth do not
-        lie where stereo has measured.
+        lie where stereo has measured, or what a person has said of them leads nowhere: the cameras
+        do not rest on it.
     """
     held = held_teeth(context, views, cameras)
     try:
@@ -138,7 +139,7 @@ def completed_by_teeth(
             teeth.small.dentitions, teeth.small.fit, measured, held.surface, context.threads,
             teeth.full,
         )  # fmt: skip
-    except ReconstructionError:
+    except (ReconstructionError, RequestError):
         return None
     seen = as_seen(surface, held.centred, views.views, scale, turn)
     return [

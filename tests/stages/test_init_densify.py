@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
-from pipeline.errors import ReconstructionError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init import densify
 from stages.init.config import InitConfig
@@ -39,10 +39,9 @@ def context(tmp_path, teeth=None, **settings):
         (2, read_teeth(2), {}, False),
         (3, read_teeth(2), {}, False),
         (3, read_teeth(3, aside=(1,)), {}, False),
-        (3, read_teeth(), {"dental": {"order": ("right", "left")}}, False),
-        (3, read_teeth(), {"dental": {"order": ("right", "frontal", "left")}}, True),
+        (3, read_teeth(), {"dental": {"complete_depth": False}}, False),
     ],
-    ids=["three", "no teeth", "four", "two", "one without", "set aside", "other order", "order"],
+    ids=["three", "no teeth", "four", "two", "one without", "set aside", "switched off"],
 )
 def test_three_photographs_of_teeth_are_completed(tmp_path, count, teeth, settings, expected):
     asked = context(tmp_path, teeth, **settings)
@@ -109,17 +108,25 @@ def test_what_is_measured_stays_and_crowns_fill_the_rest(tmp_path, monkeypatch):
         assert not depth[~known].any()
 
 
-def test_teeth_that_are_not_where_the_depth_is_complete_nothing(tmp_path, monkeypatch):
+@pytest.mark.parametrize("why", [ReconstructionError, RequestError])
+def test_teeth_that_are_not_where_the_depth_is_complete_nothing(tmp_path, monkeypatch, why):
     ball_before_the_cameras(monkeypatch)
 
     def elsewhere(*_):
-        raise ReconstructionError("the crowns would lie elsewhere")
+        raise why("the crowns would lie elsewhere")
 
     monkeypatch.setattr(densify, "completed_surface", elsewhere)
     asked = context(tmp_path, read_teeth())
     views = photographs()
     assert densify.completed_by_teeth(asked, views, cameras(), stereo(np.ones(SIZE, bool))) is None
     assert asked.warnings == []
+
+
+def test_an_order_of_other_photographs_stops_nothing(tmp_path):
+    asked = context(tmp_path, read_teeth(), dental={"order": ("right", "left")})
+    views = photographs()
+    dense = stereo(np.ones(SIZE, bool))
+    assert densify.completed_by_teeth(asked, views, cameras(), dense) is None
 
 
 def test_mirror_images_are_not_completed(tmp_path):
