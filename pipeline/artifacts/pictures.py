@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Self
@@ -12,6 +12,24 @@ import numpy.typing as npt
 
 from pipeline.artifacts.base import Artifact
 from pipeline.artifacts.views import read_png, write_png
+
+Picture = npt.NDArray[np.uint8]
+
+
+class PicturesIn(Mapping[str, Picture]):
+    """The PNG files of a folder: name without suffix -> picture, read when it is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files = {path.stem: path for path in sorted(folder.glob("*.png"))}
+
+    def __getitem__(self, name: str) -> Picture:
+        return read_png(self._files[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
 
 @dataclass(frozen=True)
@@ -23,7 +41,7 @@ class Pictures(Artifact):
     """
 
     kind: ClassVar[str] = "pictures"
-    images: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+    images: Mapping[str, Picture] = field(default_factory=dict)
 
     def save(self, folder: Path) -> None:
         for name, image in sorted(self.images.items()):
@@ -31,4 +49,4 @@ class Pictures(Artifact):
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        return cls({path.stem: read_png(path) for path in sorted(folder.glob("*.png"))})
+        return cls(PicturesIn(folder))

@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from pipeline.artifacts.base import Artifact
 from pipeline.artifacts.dental.fdi import JAWS, Jaw, universal_number
-from pipeline.artifacts.views import read_png, write_png
+from pipeline.artifacts.pictures import Picture, PicturesIn
+from pipeline.artifacts.views import write_png
 
 Point = npt.NDArray[np.float64]  # [2] x, y in pixels of the working image, pixel centres at .5
 Bool = npt.NDArray[np.bool_]
-Picture = npt.NDArray[np.uint8]  # [H, W, 3] sRGB
 
 #: Fixed-point bits of OpenCV's drawing coordinates.
 _SHIFT = 4
@@ -189,8 +189,7 @@ class Teeth(Artifact):
     @classmethod
     def load(cls, folder: Path) -> Self:
         entries = json.loads((folder / "teeth.json").read_text())["views"]
-        pictures = {path.stem: read_png(path) for path in sorted(folder.glob("*.png"))}
-        return cls(tuple(_view(entry) for entry in entries), pictures)
+        return cls(tuple(_view(entry) for entry in entries), PicturesIn(folder))
 
 
 _POINTS = (

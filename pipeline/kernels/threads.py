@@ -9,6 +9,7 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
 
 @contextmanager
@@ -39,3 +40,14 @@ def in_threads(
             results.append(result)
             progress(len(results))
     return results
+
+
+def side_by_side(
+    main: Callable[[], Result], beside: Callable[[], Other], threads: int
+) -> tuple[Result, Other]:
+    """What two functions return; `beside` runs in a thread of its own if there are two or more."""
+    if threads < 2:
+        return main(), beside()
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(beside)
+        return main(), other.result()

@@ -89,13 +89,14 @@ def _agreed(
         return None
     teeth = agreed_numbers(read, placed, cameras.cameras, depths)
     seen, by_name = {view.name for view in placed}, views.by_name()
-    pictures = {
+    drawn = {
         dentition.name: labelled_overlay(by_name[dentition.name].image, dentition)
         for dentition in teeth.chosen if dentition.name in seen
     }  # fmt: skip
+    others = {name: read.pictures[name] for name in read.pictures if name not in drawn}
     numbers = {c.number for view in teeth.chosen if view.name in seen for c in view.all_crowns}
     context.summarize(teeth=len(numbers - {0}))
-    return replace(teeth, pictures={**read.pictures, **pictures})
+    return replace(teeth, pictures={**others, **drawn})
 
 
 def _with_mouth(

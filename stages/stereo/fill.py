@@ -94,6 +94,30 @@ def complete(
     return value
 
 
+def continued(guess: Array, known: Array, gray: Array, most: float, reach_px: float) -> Array:
+    """A guessed depth, moved so that it goes on from what is known beside it.
+
+    Where both are, they differ; the guess is off by as much next to that, and by ever less further
+    away (see `complete`).
+
+    Args:
+        guess: [H, W] float32 z-depth, 0 where there is none.
+        known: [H, W] float32 z-depth, 0 where unknown.
+        gray: [H, W] float32 in 0..1, whose edges end what goes on.
+        most: where both differ by more than this depth, one of them is of something else.
+        reach_px: how far it goes on where there are no edges, in pixels.
+
+    Returns:
+        [H, W] float32 z-depth, 0 where `guess` has none.
+    """
+    there = guess > 0
+    both = there & (known > 0) & (np.abs(known - guess) < most)
+    inverse = np.where(there, 1 / np.where(there, guess, 1), 0)
+    off = np.where(both, 1 / np.where(both, known, 1) - inverse, 0)
+    off = complete(off.astype(np.float32), both.astype(np.float32), gray, 0.0, reach_px)
+    return np.where(there, 1 / np.where(there, inverse + off, 1), 0).astype(np.float32)
+
+
 def distance_to(known: npt.NDArray[np.bool_]) -> Array:
     """Distance in pixels [H, W] float32 of every pixel to the nearest known one."""
     if not known.any():

@@ -11,6 +11,7 @@ import pytest
 from pipeline.artifacts.confidence import COMPLETED
 from stages.stereo import DenseOptions, DenseView, dense_depths
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
+from stages.stereo.fill import continued
 from stages.stereo.polish import polish, source_maps
 from stages.stereo.sgbm import sgbm_depth
 from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
@@ -376,3 +377,30 @@ def test_costs_inside_a_range_are_those_of_the_full_sweep():
     )  # fmt: skip
     np.testing.assert_array_equal(some[:, :, 1:4], whole[:, :, 1:4])
     assert (whole.argmin(2) == 2).mean() > 0.7
+
+
+def test_a_guess_goes_on_from_what_is_known_beside_it():
+    guess = np.full((60, 200), np.float32(10))
+    guess[:5] = 0
+    known = np.zeros_like(guess)
+    known[:, :50] = 10.4
+    known[30, 20] = 14  # of something else
+    gray = np.full_like(guess, 0.5)
+    found = continued(guess, known, gray, most=1.0, reach_px=20.0)
+    assert not found[:5].any()
+    np.testing.assert_allclose(found[10:, 50], 10.37, atol=0.02)
+    np.testing.assert_allclose(found[10:, 190], 10, atol=0.01)
+    assert (np.diff(found[40, 50:]) <= 1e-6).all()
+    edge = gray.copy()
+    edge[:, 60:] = 0.9
+    beyond = continued(guess, known, edge, most=1.0, reach_px=20.0)
+    assert (beyond[10:, 55] > 10.3).all()
+    np.testing.assert_allclose(beyond[10:, 62:], 10, atol=0.02)
+
+
+def test_a_guess_with_nothing_beside_it_stays():
+    guess = np.full((40, 40), np.float32(10))
+    for known in (np.zeros_like(guess), np.full_like(guess, 20)):
+        np.testing.assert_allclose(
+            continued(guess, known, np.zeros_like(guess), 1.0, 20.0), guess, rtol=1e-5
+        )

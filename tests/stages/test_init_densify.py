@@ -76,7 +76,7 @@ def ball_before_the_cameras(monkeypatch):
         small = type("Small", (), {
             "views": views, "dentitions": found.dentitions, "fit": found.fit,
         })  # fmt: skip
-        return PlacedTeeth(views, found.dentitions, found.fit, small, [], {})
+        return PlacedTeeth(views, found.dentitions, found.fit, small, [])
 
     def surface(images, valid, dentitions, fit, depths, *_):
         asked["depths"] = depths
@@ -92,9 +92,10 @@ def test_what_is_measured_stays_and_crowns_fill_the_rest(tmp_path, monkeypatch):
     known = np.zeros(SIZE, bool)
     known[:, :40] = True
     dense = stereo(known)
-    result = densify.completed_by_teeth(
-        context(tmp_path, read_teeth()), photographs(), cameras(), dense
+    result, completed = densify.completed_by_teeth(
+        context(tmp_path, read_teeth()), photographs(), cameras(), lambda: dense
     )
+    assert completed
     for there, before, ball in zip(result, dense, found.surface.views, strict=True):
         np.testing.assert_array_equal(there.depth[known], before.depth[known])
         np.testing.assert_array_equal(there.confidence[known], 7)
@@ -108,25 +109,33 @@ def test_what_is_measured_stays_and_crowns_fill_the_rest(tmp_path, monkeypatch):
         assert not depth[~known].any()
 
 
-@pytest.mark.parametrize("why", [ReconstructionError, RequestError])
-def test_teeth_that_are_not_where_the_depth_is_complete_nothing(tmp_path, monkeypatch, why):
+@pytest.mark.parametrize(
+    ("where", "why"),
+    [
+        ("stages.init.densify.completed_surface", ReconstructionError),
+        ("stages.init.dental.place_known.place_teeth", ReconstructionError),
+        ("stages.init.dental.place_known.place_teeth", RequestError),
+    ],
+)
+def test_teeth_that_are_not_where_the_depth_is_complete_nothing(tmp_path, monkeypatch, where, why):
     ball_before_the_cameras(monkeypatch)
 
-    def elsewhere(*_):
+    def elsewhere(*_, **__):
         raise why("the crowns would lie elsewhere")
 
-    monkeypatch.setattr(densify, "completed_surface", elsewhere)
+    monkeypatch.setattr(where, elsewhere)
     asked = context(tmp_path, read_teeth())
-    views = photographs()
-    assert densify.completed_by_teeth(asked, views, cameras(), stereo(np.ones(SIZE, bool))) is None
+    dense = stereo(np.ones(SIZE, bool))
+    found = densify.completed_by_teeth(asked, photographs(), cameras(), lambda: dense)
+    assert found == (dense, False)
     assert asked.warnings == []
 
 
 def test_an_order_of_other_photographs_stops_nothing(tmp_path):
     asked = context(tmp_path, read_teeth(), dental={"order": ("right", "left")})
-    views = photographs()
     dense = stereo(np.ones(SIZE, bool))
-    assert densify.completed_by_teeth(asked, views, cameras(), dense) is None
+    found = densify.completed_by_teeth(asked, photographs(), cameras(), lambda: dense)
+    assert found == (dense, False)
 
 
 def test_mirror_images_are_not_completed(tmp_path):

@@ -35,6 +35,7 @@ from stages.init.dental.place import (
 from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import (
     PlacedTeeth,
+    Progress,
     Reconstruction,
     place_teeth,
     with_surface,
@@ -130,17 +131,26 @@ class HeldTeeth:
     surface: SurfaceOptions
 
     def placed(
-        self, context: StageContext, views: Views, cameras: Sequence[Camera], accept_doubtful: bool
-    ) -> PlacedTeeth:
+        self, context: StageContext, views: Views, cameras: Sequence[Camera],
+        accept_doubtful: bool, quickly: bool = False,
+    ) -> PlacedTeeth:  # fmt: skip
         """Which tooth is which before these cameras, of these photographs.
+
+        Args:
+            quickly: without matching photographs on the arch, which speaks for or against numbers
+                and cameras, and in silence.
 
         Raises:
             ReconstructionError: no teeth, or they are doubtful, or don't fit the cameras.
         """
+        options = arch_options(context.config.dental, views)
+        progress: Progress = context.progress
+        if quickly:
+            options, progress = replace(options, dense_rounds=0), _silent
         teeth = place_teeth(
             [found.view for found in self.centred], self.names, self.dentitions,
-            [found.focal for found in self.centred], arch_options(context.config.dental, views),
-            accept_doubtful=accept_doubtful, threads=context.threads, progress=context.progress,
+            [found.focal for found in self.centred], options,
+            accept_doubtful=accept_doubtful, threads=context.threads, progress=progress,
             cameras=[camera.cam_from_world for camera in cameras],
             scales=[working_scale(view.width, view.height) for view in views.views],
         )  # fmt: skip
@@ -150,6 +160,10 @@ class HeldTeeth:
                 f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
             )
         return teeth
+
+
+def _silent(step: str, done: int, total: int) -> None:
+    """Progress that nobody is told of."""
 
 
 def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -> HeldTeeth:

@@ -66,7 +66,6 @@ class PlacedTeeth:
         views, dentitions, fit: as of `Reconstruction`.
         small: all that at the size that was worked at.
         full: the photographs as they are, for depths and colours.
-        pictures: the labelled photographs.
     """
 
     views: list[View]
@@ -74,7 +73,11 @@ class PlacedTeeth:
     fit: ArchFit
     small: Turned
     full: list[FullSize | None]
-    pictures: dict[str, Picture]
+
+    @property
+    def pictures(self) -> dict[str, Picture]:
+        """The photographs with the numbers of their teeth, drawn when asked for."""
+        return labelled(self.views, self.dentitions)
 
 
 def reconstruct_teeth(
@@ -149,7 +152,6 @@ def place_teeth(
         None if dentition is None else with_numbers(dentition, placed, fit)
         for dentition, placed in zip(dentitions, fit.views, strict=True)
     ]
-    pictures = labelled(views, numbered)
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
         shown = [f"{doubt[0].upper()}{doubt[1:].rstrip('.')}." for doubt in fit.doubts]
@@ -158,14 +160,14 @@ def place_teeth(
             "Check the numbers in the labelled photographs; a wrong one can be put right on the "
             f"page check.html. {HOW_TO_SHOOT_TEETH} If you know better, go on all the same: "
             "--set init.dental.accept_doubtful=true.",
-            pictures,
+            labelled(views, numbered),
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
     full = [
         FullSize(view.image, view.valid(), d.mask, d.above) if d else None
         for view, d in zip(views, numbered, strict=True)
     ]
-    return PlacedTeeth(views, numbered, fit, turned, full, pictures)
+    return PlacedTeeth(views, numbered, fit, turned, full)
 
 
 def with_surface(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,12 @@ from pipeline.kernels.threads import in_threads
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Matches
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
-from stages.init.dental.cameras.unrolled import PairFigures, match_neighbours, prepare_photo
+from stages.init.dental.cameras.unrolled import (
+    PairFigures,
+    Photo,
+    match_neighbours,
+    prepare_photo,
+)
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import colour_distances
@@ -323,12 +329,16 @@ class _Matching:
     ) -> None:  # fmt: skip
         self._scorer, self._options = scorer, options
         self._first: dict[Labelling, _FirstRound] = {}
-        self._photos = in_threads(
+        self._given = list(zip(images, valid, dentitions, strict=True))
+
+    @cached_property
+    def _photos(self) -> list[Photo]:
+        return in_threads(
             lambda photo: prepare_photo(
                 photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
             ),
-            zip(images, valid, dentitions, strict=True),
-            scorer.threads,
+            self._given,
+            self._scorer.threads,
         )
 
     def shares(self, scored: Scored) -> dict[tuple[int, int], float]:
