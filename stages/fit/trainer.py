@@ -238,9 +238,17 @@ class Trainer:
 
     def composited(self, view: int | None, rendering: Rendering) -> Floats:
         """[3, H, W] colour as it arrives at a view, or at none of them."""
-        image = rendering.planes[:3]
+        return self._shown(view, rendering.planes[:3], rendering.transmittance)
+
+    def without_gaussians(self, view: int) -> Floats:
+        """[3, H, W] what arrives at a view where no Gaussian stands before the background."""
+        target = self.targets[view][1]
+        clear = np.ones((target.height, target.width), np.float32)
+        return self._shown(view, np.zeros((3, *clear.shape), np.float32), clear)
+
+    def _shown(self, view: int | None, image: Floats, transmittance: Floats) -> Floats:
         for part in reversed(self.parts):
-            image = part.show(view, image, rendering.transmittance)
+            image = part.show(view, image, transmittance)
         return np.ascontiguousarray(image)
 
     def diverged(self, what: str) -> ReconstructionError:
