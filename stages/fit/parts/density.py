@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 SETTLE = 100
 #: a photograph looks like the background where, blurred by so many pixels of one 512 wide, no
 #: channel is off by more. With final_prune_empty at .8, unseen views of five triples of scan video
-#: whose cameras features found gain .25 dB, of four wide ones with exact cameras .3, and the input
-#: views lose .2; 3/255 and .95: .05 and less; 12/255 and .6: .3 and .4, but input views lose .5.
+#: whose cameras features found gain .23 dB, of four wide ones with exact cameras .29, and the input
+#: views lose .2; 3/255 and .8: .03; 12/255 and .6: .3 and .4, but input views lose .5. From six
+#: views on nothing is gained (twelve: -.07).
 UNSEEN, NOISE_PX = 8 / 255, 1.5
 #: what lies within so many spacings of a point that was measured is something, however dark
 MEASURED_REACH = 2.0
@@ -190,10 +191,10 @@ class Floaters(
         final_prune_masked: AutoFloat = automatic({3: 0.2}, held=0.0, le=1)
         """finally remove Gaussians with less than this share of their area inside the masks: they
         have grown out of them (a held surface has a rim and no needles)"""
-        final_prune_empty: Annotated[float, Field(gt=0, le=1)] = 0.8
+        final_prune_empty: AutoFloat = automatic({3: 0.8, 6: 1.0}, le=1)
         """finally remove Gaussians where nothing was measured, with more than this share of their
         area where photographs look like the background behind everything: nobody misses them
-        there, and from elsewhere they are specks"""
+        there, and from elsewhere they are specks (many views know better)"""
 
     def __init__(self, fit: Trainer) -> None:
         self.positions, self.removed = fit.scene.cloud.positions, 0
