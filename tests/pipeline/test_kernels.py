@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import warnings
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 from pipeline.kernels import cache, folder, kernel, kernel_threads, news, rehearsals
 from pipeline.kernels import each as each_piece
-from pipeline.kernels.threads import in_threads, one_opencv_thread
+from pipeline.kernels.threads import in_threads, one_opencv_thread, side_by_side
 
 ROOT = Path(__file__).resolve().parents[2]
 KERNELS = """
@@ -218,3 +219,20 @@ def test_what_threads_find_comes_in_the_order_of_the_items():
     done = []
     assert in_threads(lambda k: k * k, range(7), 3, done.append) == [k * k for k in range(7)]
     assert done == list(range(1, 8))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_two_functions_run_side_by_side_where_there_are_threads(threads):
+    def here():
+        return threading.get_ident()
+
+    main, beside = side_by_side(here, here, threads)
+    assert main == here()
+    assert (beside == here()) is (threads == 1)
+
+    def wrong():
+        raise ValueError("wrong")
+
+    for pair in ((wrong, here), (here, wrong)):
+        with pytest.raises(ValueError, match="wrong"):
+            side_by_side(*pair, threads)

@@ -282,7 +282,7 @@ def near_measured(fit: Trainer, rows: Bools) -> Bools:
 
 
 def worth_keeping(fit: Trainer, positions: Array) -> Bools:
-    """[N] False for Gaussians that colour nothing, and for those right before a lens.
+    """[N] False for Gaussians that colour nothing or what is empty, and for those before a lens.
 
     What a Gaussian colours outside the masks, no photograph has a say in: one that does mostly
     that is a needle that has grown into the masked part.
