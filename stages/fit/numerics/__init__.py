@@ -9,6 +9,7 @@ if TYPE_CHECKING:
         colours,
         density,
         detail,
+        emptiness,
         light,
         moments,
         objectives,

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from pipeline.errors import ReconstructionError
 from stages.fit import numerics
@@ -16,7 +14,6 @@ from stages.fit.arrays import AnyArray, Array, Bools, Floats, Indices
 from stages.fit.parts.base import Figures, Part, Step, logit
 from stages.fit.parts.camera import Background
 from stages.fit.settings import (
-    PIXELS,
     AutoBool,
     AutoFloat,
     AutoInt,
@@ -27,7 +24,6 @@ from stages.fit.settings import (
     Whole,
     automatic,
 )
-from stages.splatting.threads import workers
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
@@ -35,16 +31,6 @@ if TYPE_CHECKING:
 
 #: iterations before the end at which Gaussians are split last: these still need steps to settle
 SETTLE = 100
-#: a photograph looks like the background where, blurred by so many pixels of one 512 wide, no
-#: channel is off by more. With final_prune_empty at .8, unseen views of five triples of scan video
-#: whose cameras features found gain .23 dB, of four wide ones with exact cameras .29, and the input
-#: views lose .2; 3/255 and .8: .03; 12/255 and .6: .3 and .4, but input views lose .5. From six
-#: views on nothing is gained (twelve: -.07).
-UNSEEN, NOISE_PX = 8 / 255, 1.5
-#: what lies within so many spacings of a point that was measured is something, however dark
-MEASURED_REACH = 2.0
-#: so many points tell the spacing
-SAMPLED = 5000
 
 
 class Density(
@@ -238,12 +224,7 @@ def looks_empty(fit: Trainer, view: int) -> Floats:
     behind = fit.find(Background)
     if behind is None or not behind.values.any():
         return np.zeros(photograph.shape[1:], np.float32)
-    sigma = NOISE_PX * np.sqrt(photograph[0].size / PIXELS)
-    off = [
-        np.abs(cv2.GaussianBlur(channel, (0, 0), sigma) - empty)
-        for channel, empty in zip(photograph, fit.without_gaussians(view), strict=True)
-    ]
-    return (np.max(off, axis=0) < UNSEEN).astype(np.float32)
+    return numerics.emptiness.looks_like(photograph, fit.without_gaussians(view))
 
 
 def in_picture(points: AnyArray, viewpoint: Viewpoint) -> tuple[Any, Bools]:
@@ -266,21 +247,6 @@ def before_lens(packed: Floats, viewpoints: Sequence[Viewpoint], nearest: Sequen
     return close
 
 
-def near_measured(fit: Trainer, rows: Bools) -> Bools:
-    """[N] those of some Gaussians [N] that lie where points were measured, and not filled in."""
-    measured = fit.scene.cloud.positions[fit.scene.trusted]
-    found = np.zeros(len(rows), bool)
-    if rows.any() and len(measured) > 1:
-        tree = cKDTree(measured)
-        some = measured[:: max(1, len(measured) // SAMPLED)]
-        reach = MEASURED_REACH * np.median(tree.query(some, 2, workers=workers())[0][:, 1])
-        away, _ = tree.query(
-            fit.packed[rows, :3], distance_upper_bound=reach, workers=workers()
-        )  # fmt: skip
-        found[rows] = np.isfinite(away)
-    return found
-
-
 def worth_keeping(fit: Trainer, positions: Array) -> Bools:
     """[N] False for Gaussians that colour nothing or what is empty, and for those before a lens.
 
@@ -301,7 +267,8 @@ def worth_keeping(fit: Trainer, positions: Array) -> Bools:
         nearest.append(s.final_prune_near * limit)
     everywhere, within, empty = areas
     keep = (most >= s.final_prune_contribution) & (within >= s.final_prune_masked * everywhere)
-    unseen = empty > s.final_prune_empty * within
-    keep &= ~unseen | near_measured(fit, unseen)
+    unseen = np.flatnonzero(empty > s.final_prune_empty * within)
+    measured = fit.scene.cloud.positions[fit.scene.trusted]
+    keep[unseen] &= numerics.emptiness.near_measured(fit.packed[unseen, :3], measured)
     keep &= fit.packed[:, 10] > logit(s.prune_opacity)
     return np.asarray(keep & ~before_lens(fit.packed, viewpoints, nearest))
