@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,8 @@ from hypothesis import strategies as st
 from pipeline.config import load_config, parse_override, presets, result_fields
 from pipeline.errors import RequestError
 from pipeline.workspace import _yaml_value
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_override_reaches_the_stage(toys: Path) -> None:
@@ -93,3 +97,16 @@ def test_values_survive_the_command_line(value: object) -> None:
 )
 def test_on_and_off_are_words(text: str, value: object) -> None:
     assert parse_override(text) == ("a.b", value)
+
+
+def test_settings_load_nothing_that_takes_long() -> None:
+    """A run that finds everything in the store should not wait for libraries that it never asks."""
+    program = (
+        "import sys; from pipeline.config import load_config; load_config(); "
+        "heavy = 'numba', 'scipy', 'torch', 'pycolmap', 'open3d', 'pymeshlab', 'onnxruntime'; "
+        "print(*(name for name in heavy if name in sys.modules))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    assert found.stdout.split() == []
