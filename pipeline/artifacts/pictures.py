@@ -11,19 +11,24 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.base import Artifact
-from pipeline.artifacts.views import read_png, write_png
+from pipeline.artifacts.views import decoded_png, write_png
 
 Picture = npt.NDArray[np.uint8]
 
 
 class PicturesIn(Mapping[str, Picture]):
-    """The PNG files of a folder: name without suffix -> picture, read when it is asked for."""
+    """The PNG files of a folder: name without suffix -> picture, decoded when it is asked for.
+
+    The files may be gone by then.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self._files = {path.stem: path for path in sorted(folder.glob("*.png"))}
+        self._files = {
+            path.stem: (path.read_bytes(), path) for path in sorted(folder.glob("*.png"))
+        }
 
     def __getitem__(self, name: str) -> Picture:
-        return read_png(self._files[name])
+        return decoded_png(*self._files[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._files)

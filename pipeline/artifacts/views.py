@@ -179,7 +179,12 @@ def write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 def read_png(path: Path) -> npt.NDArray[np.uint8]:
     """Read a PNG as written by `write_png`: [H, W] or RGB [H, W, 3] uint8."""
-    data = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    return decoded_png(path.read_bytes(), path)
+
+
+def decoded_png(encoded: bytes, path: Path) -> npt.NDArray[np.uint8]:
+    """What `read_png` makes of the bytes of a file; its path is for the message."""
+    data = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
     if data is None:
         raise ValueError(f"{path} is not a readable PNG")
     return np.ascontiguousarray(data if data.ndim == 2 else data[..., ::-1])
