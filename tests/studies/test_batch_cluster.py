@@ -18,6 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
+from pipeline.studies.batch.cluster import slots
 from tests.studies import toy_batch
 
 pytest.importorskip("distributed")
@@ -97,6 +98,16 @@ def lines(folder: Path, stage: str) -> list[list[Any]]:
     file = folder / "log.txt"
     told = map(json.loads, file.read_text().splitlines()) if file.exists() else iter(())
     return [entry[1:] for entry in told if entry[0] == stage]
+
+
+def test_a_scheduler_that_went_while_it_was_asked_has_no_places() -> None:
+    from distributed.comm import CommClosedError
+
+    class Client:
+        def nthreads(self) -> dict[str, int]:
+            raise CommClosedError("reset by peer")
+
+    assert slots(Client()) == 0
 
 
 def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(

@@ -97,8 +97,14 @@ def check_workers(client: Any, out: Path, batch: str) -> None:
 
 
 def slots(client: Any) -> int:
-    """How many cases can run at a time, as far as is known now."""
-    return sum(client.nthreads().values())
+    """How many cases can run at a time, as far as is known now; 0 if nobody answers.
+
+    A scheduler that has gone just now is missed by the client before long, which then says so.
+    """
+    try:
+        return sum(client.nthreads().values())
+    except (OSError, TimeoutError):  # a connection that is closed is an OSError of dask's
+        return 0
 
 
 def _address(scheduler: str) -> str:
