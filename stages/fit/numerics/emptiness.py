@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stages.fit.arrays import Array, Bools, Floats
-from stages.fit.settings import PIXELS
 from stages.splatting.threads import workers
 
 #: a photograph looks like the background where, blurred by so many pixels of one 512 wide, no
@@ -22,18 +21,21 @@ MEASURED_REACH = 2.0
 SAMPLED = 5000
 
 
-def looks_like(photograph: Floats, background: Floats) -> Floats:
-    """[H, W] float32, 1 where a photograph [3, H, W] looks like the background [3, H, W]."""
-    sigma = NOISE_PX * np.sqrt(photograph[0].size / PIXELS)
+def looks_like(photograph: Floats, background: Floats, scale: float) -> Floats:
+    """[H, W] float32, 1 where a photograph [3, H, W] looks like the background [3, H, W].
+
+    Args:
+        scale: of its pixels, in pixels of a picture 512 wide.
+    """
     off = [
-        np.abs(cv2.GaussianBlur(channel, (0, 0), sigma) - behind)
+        np.abs(cv2.GaussianBlur(channel, (0, 0), NOISE_PX * scale) - behind)
         for channel, behind in zip(photograph, background, strict=True)
     ]
     return np.asarray(np.max(off, axis=0) < UNSEEN, np.float32)
 
 
 def near_measured(positions: Floats, measured: Array) -> Bools:
-    """[N] which of some positions [N, 3] lie where points [M, 3] were measured."""
+    """[N] which of some positions [N, 3] lie where points [M, 3] were measured, in one frame."""
     if not len(positions) or len(measured) < 2:
         return np.zeros(len(positions), bool)
     tree = cKDTree(measured)

@@ -14,6 +14,7 @@ from stages.fit.arrays import AnyArray, Array, Bools, Floats, Indices
 from stages.fit.parts.base import Figures, Part, Step, logit
 from stages.fit.parts.camera import Background
 from stages.fit.settings import (
+    PIXELS,
     AutoBool,
     AutoFloat,
     AutoInt,
@@ -224,7 +225,8 @@ def looks_empty(fit: Trainer, view: int) -> Floats:
     behind = fit.find(Background)
     if behind is None or not behind.values.any():
         return np.zeros(photograph.shape[1:], np.float32)
-    return numerics.emptiness.looks_like(photograph, fit.without_gaussians(view))
+    scale = np.sqrt(photograph[0].size / PIXELS)
+    return numerics.emptiness.looks_like(photograph, fit.without_gaussians(view), scale)
 
 
 def in_picture(points: AnyArray, viewpoint: Viewpoint) -> tuple[Any, Bools]:

@@ -146,7 +146,7 @@ class HeldTeeth:
         options = arch_options(context.config.dental, views)
         progress: Progress = context.progress
         if quickly:
-            options, progress = replace(options, dense_rounds=0), _silent
+            options, progress = replace(options, dense_rounds=0), lambda *_: None
         teeth = place_teeth(
             [found.view for found in self.centred], self.names, self.dentitions,
             [found.focal for found in self.centred], options,
@@ -160,10 +160,6 @@ class HeldTeeth:
                 f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
             )
         return teeth
-
-
-def _silent(step: str, done: int, total: int) -> None:
-    """Progress that nobody is told of."""
 
 
 def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -> HeldTeeth:

@@ -2,7 +2,7 @@
 
 The teeth are the landmarks, a textbook arch is the prior: labellings are compared by evidence
 (`hypotheses`, `edits`), near ones by how the pictures match on the unrolled arch (`rivals`,
-`unrolled`), the best one is refined with these matches, and what speaks against it is said
+`matching`), the best one is refined with these matches, and what speaks against it is said
 (`confidence`).
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +17,8 @@ import numpy.typing as npt
 from pipeline.artifacts.dental.fdi import JAWS, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
-from pipeline.kernels.threads import in_threads
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
-from stages.init.dental.cameras.bundle import Matches
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
-from stages.init.dental.cameras.unrolled import (
-    PairFigures,
-    Photo,
-    match_neighbours,
-    prepare_photo,
-)
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import colour_distances
@@ -50,13 +41,13 @@ from stages.init.dental.numbering.edits import (
 )
 from stages.init.dental.numbering.hypotheses import (
     MAIN_ROLES,
-    Labelling,
     Scored,
     Scorer,
     roles_of_view,
     search,
     view_candidates,
 )
+from stages.init.dental.numbering.matching import Matching
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
 from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
 from stages.init.dental.numbering.rivals import judged_by_pictures, label_doubts, margins
@@ -70,7 +61,6 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
-_FirstRound = tuple[Scored, Matches, dict[tuple[int, int], PairFigures]]
 
 #: A photograph needs this many crowns in all to be placed.
 MIN_CROWNS = 4
@@ -167,7 +157,7 @@ def fit_arch(
             scorer, best, others, primary = child, rival, rivals, rival_primary
     best, ends = settle_ends(scorer, best, fixed)
     others += ends
-    matching = _Matching(
+    matching = Matching(
         scorer, read, [images[i] for i in placeable], [valid[i] for i in placeable], options
     )
     if options.dense_rounds:
@@ -318,79 +308,6 @@ def _keep_order(
         hint = "left and right are swapped, or the photographs are mirrored"
     sentence = f"the order given contradicts the teeth: {hint}; see {', '.join(wrong)}"
     return free_best, free_others, free, [sentence] if wrong else []
-
-
-class _Matching:
-    """Dense matches of the photographs of a fit, on the arch that a labelling unrolls."""
-
-    def __init__(
-        self, scorer: Scorer, dentitions: list[Dentition], images: list[Image],
-        valid: list[Mask], options: ArchOptions,
-    ) -> None:  # fmt: skip
-        self._scorer, self._options = scorer, options
-        self._first: dict[Labelling, _FirstRound] = {}
-        self._given = list(zip(images, valid, dentitions, strict=True))
-
-    @cached_property
-    def _photos(self) -> list[Photo]:
-        return in_threads(
-            lambda photo: prepare_photo(
-                photo[0], photo[1], photo[2].mask, photo[2].roll, photo[2].band_height
-            ),
-            self._given,
-            self._scorer.threads,
-        )
-
-    def shares(self, scored: Scored) -> dict[tuple[int, int], float]:
-        """Pair of views -> the share of what both see that matches, cameras as the teeth say."""
-        _, _, pairs = self._first_round(scored)
-        return {pair: figures.share for pair, figures in pairs.items()}
-
-    def refined(
-        self, best: Scored, progress: Progress
-    ) -> tuple[Scored, dict[tuple[int, int], PairFigures]]:
-        """The cameras of a numbering: rounds of dense matches and bundle adjustment."""
-        scorer, options = self._scorer, self._options
-        if not options.dense_rounds:
-            return self._as_cameras(best), {}
-        best, matches, pairs = self._first_round(best)
-        # With cameras that are known, matches can only speak for or against them.
-        rounds = min(options.dense_rounds, 1) if scorer.held else options.dense_rounds
-        for done in range(rounds):
-            progress("dense matches on the arch", done, rounds)
-            if done:
-                matches, pairs = self._matched(best)
-            if not scorer.held:
-                start = (best.adjusted.unknowns, best.adjusted.offsets)
-                best = scorer.solve(
-                    best.labelling, start, matches=matches, deviation=options.landmark_deviation
-                )
-        progress("dense matches on the arch", rounds, rounds)
-        return best, pairs
-
-    def _first_round(self, scored: Scored) -> _FirstRound:
-        """Solved for its cameras, and the matches on their arch; once for each labelling."""
-        if scored.labelling not in self._first:
-            solved = self._as_cameras(scored)
-            self._first[scored.labelling] = (solved, *self._matched(solved))
-        return self._first[scored.labelling]
-
-    def _matched(self, scored: Scored) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
-        options = self._options
-        return match_neighbours(
-            scored.adjusted, self._photos, options.chart_scale, options.dense_weight
-        )
-
-    def _as_cameras(self, scored: Scored) -> Scored:
-        """Solved for its cameras rather than to compare it with others."""
-        options = self._options
-        offsets = scored.adjusted.offsets * (
-            options.numbering_deviation / options.landmark_deviation
-        )
-        return self._scorer.solve(
-            scored.labelling, (scored.adjusted.unknowns, offsets),
-            deviation=options.landmark_deviation,
-        )  # fmt: skip
 
 
 def _outcome(
