@@ -19,7 +19,7 @@ COPY pipeline pipeline
 COPY stages stages
 COPY configs configs
 # Bytecode is made here: later nobody may write beside the program. Open3D without CUDA is a third.
-RUN pip install --no-cache-dir --compile --constraint constraints.txt '.[dicom]' \
+RUN pip install --no-cache-dir --compile --constraint constraints.txt '.[batch,dicom]' \
     && pip uninstall --yes open3d \
     && pip install --no-cache-dir --compile open3d-cpu \
     && rm -rf /src

@@ -10,7 +10,7 @@ BIN := .venv/bin
 SEED ?= 0
 INPUTS ?= 1000
 KILLS ?= 30
-.PHONY: demo test browsers lint wheel-test docs gallery bench soak reader system chromium clean
+.PHONY: demo test browsers clusters lint wheel-test docs gallery bench soak reader system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -25,6 +25,12 @@ browsers: system chromium .venv/installed-dev
 	    PAGES_IN=$$engine xvfb-run -a -s "-screen 0 1600x1200x24" $(BIN)/python -m pytest \
 	        tests/stages/test_viewer_tools.py tests/studies/test_register_command.py || exit 1; \
 	done
+
+# The recipes for SLURM and Kubernetes of docs/batch.md, run as far as one machine can.
+clusters: system .venv/installed-dev
+	@tools/system-packages clusters
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt dask-kubernetes
+	$(BIN)/python -m pytest tests/studies/test_batch_slurm.py tests/studies/test_batch_kubernetes.py
 
 lint: .venv/installed-dev
 	$(BIN)/ruff format --check .

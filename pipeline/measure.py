@@ -6,6 +6,7 @@ On any system: some lack calls that Linux has.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 import time
@@ -14,9 +15,29 @@ from typing import Any
 
 
 def usable_cores() -> int:
-    """How many cores this process may use; where the system can't say, how many there are."""
+    """How many cores this process may use; where the system can't say, how many there are.
+
+    A container that is granted the time of so many cores (``docker run --cpus``, the limits of
+    Kubernetes) sees all those of its machine: more threads than granted cores hold each other up.
+    """
     affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    return max(1, math.ceil(min(cores, granted_cores())))
+
+
+def granted_cores(groups: Path = Path("/sys/fs/cgroup")) -> float:
+    """Cores whose time the container's control group grants, version 2 or 1; without limit inf."""
+    try:
+        if (both := groups / "cpu.max").exists():
+            quota, period = both.read_text().split()
+        else:
+            quota, period = (
+                (groups / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period")
+            )
+        granted = float(quota) / float(period)  # version 2 says "max", version 1 says -1
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf
+    return granted if granted > 0 else math.inf
 
 
 def cpu_seconds() -> float:

@@ -33,7 +33,7 @@ def test_its_system_packages_are_those_that_are_needed() -> None:
 def test_its_extra_and_command_exist() -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    for extra in re.findall(r"'\.\[(\w+)\]'", TEXT):
-        assert extra in config["options.extras_require"]
+    (extras,) = re.findall(r"'\.\[([\w,]+)\]'", TEXT)
+    assert set(extras.split(",")) <= set(config["options.extras_require"])
     assert "pipeline warmup" in TEXT and 'ENTRYPOINT ["pipeline"]' in TEXT
     assert re.search(r"^USER \d+:\d+$", TEXT, re.MULTILINE), "not root, and no account is needed"

@@ -19,10 +19,34 @@ def test_linux_counts_the_cores_that_may_be_used() -> None:
 
 def test_without_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(measure, "granted_cores", lambda: float("inf"))
     assert measure.usable_cores() == os.cpu_count()
     assert load_config().threads == os.cpu_count()
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert measure.usable_cores() == 1
+
+
+@pytest.mark.parametrize(
+    ("files", "granted"),
+    [
+        ({"cpu.max": "150000 100000\n"}, 1.5),
+        ({"cpu.max": "max 100000\n"}, float("inf")),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 4),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, float("inf")),
+        ({"cpu.max": "strange"}, float("inf")),
+        ({}, float("inf")),
+    ],
+)
+def test_a_containers_share_of_time_counts(
+    files: dict[str, str], granted: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert measure.granted_cores(tmp_path) == granted
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)), raising=False)
+    monkeypatch.setattr(measure, "granted_cores", lambda: granted)
+    assert measure.usable_cores() == min(64, {1.5: 2, 4: 4}.get(granted, 64))
 
 
 def test_without_resource_and_proc_it_still_measures(monkeypatch: pytest.MonkeyPatch) -> None:

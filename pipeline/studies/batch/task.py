@@ -208,12 +208,11 @@ def _full(out: Path) -> str:
 
 def _threads() -> int:
     """Cores for one case, where the batch does not say: those of this worker, by its slots."""
-    from dask.system import CPU_COUNT  # heeds what a container was given
     from distributed import get_worker
 
     from pipeline.measure import usable_cores
 
-    return max(1, min(usable_cores(), CPU_COUNT) // get_worker().state.nthreads)
+    return max(1, usable_cores() // get_worker().state.nthreads)
 
 
 def _memory() -> int:
