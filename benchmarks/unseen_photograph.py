@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
-#: What is the same in all runs: no light, as in each real case so far, and nothing of geometry.
+#: What is the same in all runs unless it is said anew: no light, and nothing of geometry.
 FIXED = {"light": "none", "lambda_flow": 0.0, "detail": False, "optimize_poses": False}
 #: Gaussians; the width of photographs is halved until it is at most this.
 POINTS, WIDTH = 40_000, 700
@@ -148,7 +148,7 @@ def predict(workspace: Path, view: int, settings: FitConfig) -> Prediction:
     seen = sights(scene)
     mask = seen_elsewhere(scene, seen, view)
     rest = replace(scene, cloud=coloured(scene, seen, others)).reduced(factor).without([view])
-    trainer = rest.trainer(resolved, False)
+    trainer = rest.trainer(resolved, settings.light == "camera")
     trainer.run(None, lambda *_: None)
     for part in trainer.parts:
         part.end(trainer)

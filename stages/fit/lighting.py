@@ -47,7 +47,7 @@ def _by_shading(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, flo
     if errors is None:
         return "none", {}
     without, lit = errors
-    better = lit <= settings.light_evidence * without
+    better = lit <= min(settings.light_evidence * without, settings.light_unexplained)
     figures = {"light_error_none": round(without, 4), "light_error_camera": round(lit, 4)}
     return ("camera" if better else "none"), figures
 

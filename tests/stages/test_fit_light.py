@@ -61,6 +61,26 @@ def test_on_a_held_surface_the_shading_tells_which_light_it_was(tmp_path) -> Non
         assert share < 0.7 if lit else share > 0.9
 
 
+@pytest.mark.parametrize(
+    ("errors", "light"),
+    [
+        ((0.12, 0.05), "camera"),  # the scan video
+        ((0.097, 0.067), "camera"),  # a generated mouth
+        ((0.08, 0.06), "none"),  # hardly better with it
+        ((0.129, 0.082), "none"),  # a patient's photographs, each with a flash of its own
+    ],
+)
+def test_a_light_has_to_leave_little_unexplained(
+    errors: tuple[float, float], light: str, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("stages.fit.lighting.prediction_errors", lambda *_: errors)
+    views, cameras, points, _ = case(lit=True)
+    few = Views(views=views.views[:3])
+    here = context(tmp_path, few, cameras, points, light="auto", iterations=2, hold_surface=True)
+    FitStage().run(here)
+    assert here.figures["light"] == light
+
+
 def test_nothing_is_concluded_where_no_surface_is_shared(tmp_path) -> None:
     views, cameras, points, _ = case(lit=True)
     apart = []
