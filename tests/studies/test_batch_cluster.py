@@ -7,10 +7,9 @@ import json
 import os
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +19,7 @@ import pytest
 
 from pipeline.studies.batch.cluster import slots
 from tests.studies import toy_batch
+from tests.studies.small_batch import wait_for
 
 pytest.importorskip("distributed")
 
@@ -82,15 +82,6 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     made.start()
     yield made
     made.stop()
-
-
-def wait_for(condition: Callable[[], Any], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return
-        time.sleep(0.05)
-    raise AssertionError("this never came to pass")
 
 
 def lines(folder: Path, stage: str) -> list[list[Any]]:

@@ -20,8 +20,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.studies.small_batch import ROOT, SETTINGS, summary, write_cases
-from tests.studies.test_batch_cluster import wait_for
+from tests.studies.small_batch import ROOT, SETTINGS, summary, wait_for, write_cases
 
 pytest.importorskip("distributed")
 kubernetes = pytest.importorskip("dask_kubernetes", reason="needs dask-kubernetes (make clusters)")

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.small_batch import ROOT, SETTINGS, summary, write_cases
-from tests.studies.test_batch_cluster import wait_for
+from tests.studies.small_batch import ROOT, SETTINGS, summary, wait_for, write_cases
 
 pytest.importorskip("dask_jobqueue")
 if not all(map(shutil.which, ("slurmctld", "slurmd", "sbatch", "scancel"))):

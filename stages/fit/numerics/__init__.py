@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         density,
         detail,
         emptiness,
+        harmonics,
         light,
         moments,
         objectives,

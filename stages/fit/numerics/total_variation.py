@@ -125,6 +125,28 @@ def _both_ways(found: Integers):  # type: ignore[no-untyped-def]
     return neighbours, starts
 
 
+def connected(positions: Floats, count: int) -> tuple[Integers, Integers]:
+    """Who is near whom: two Gaussians of which one is among the other's nearest, from both ends.
+
+    Args:
+        positions: [N, 3], more than one.
+        count: so many are nearest.
+
+    Returns:
+        [E] neighbours, and [N + 1] starts: those of i are neighbours[starts[i]:starts[i + 1]].
+    """
+    number = len(positions)
+    count = min(count, number - 1)
+    tree, threads = cKDTree(positions), workers()
+    found = np.empty((number, count + 1), np.int32)
+    for start in range(0, number, QUERIES):  # what the tree returns is four times as large
+        some = positions[start : start + QUERIES]
+        found[start : start + QUERIES] = tree.query(some, k=count + 1, workers=threads)[1]
+    with KERNELS:
+        neighbours, starts = _both_ways(found)
+    return neighbours, starts
+
+
 class TotalVariation:
     """Weight times the mean, over Gaussians and their neighbours, of how their colours differ.
 
@@ -164,25 +186,13 @@ class TotalVariation:
             return
         neighbours = self.neighbours
         if neighbours is None:
-            neighbours = self.neighbours = self._connect(positions)
+            neighbours, self.starts = connected(positions, self.count)
+            self.neighbours = neighbours
         inverse = F(unit / self.tolerance)
         weight = F(self.weight * unit / (number * self.count))
         kernel = _many_columns if last - first >= WIDTH else _few_columns
         with KERNELS:
             kernel(values, first, last, neighbours, self.starts, inverse, weight, gradient)
-
-    def _connect(self, positions: Floats) -> Integers:
-        """The neighbours; `starts` is set."""
-        number = len(positions)
-        count = min(self.count, number - 1)
-        tree, threads = cKDTree(positions), workers()
-        found = np.empty((number, count + 1), np.int32)
-        for start in range(0, number, QUERIES):  # what the tree returns is four times as large
-            some = positions[start : start + QUERIES]
-            found[start : start + QUERIES] = tree.query(some, k=count + 1, workers=threads)[1]
-        with KERNELS:
-            neighbours, self.starts = _both_ways(found)
-        return neighbours
 
     def forget(self) -> None:
         """Other Gaussians have taken the place of those that were compared."""

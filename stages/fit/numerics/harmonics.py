@@ -1,0 +1,111 @@
+"""How colours turn with the view where no photograph tells: as they do beside it.
+
+A Gaussian that one photograph shows may have any harmonics that come to its colour there. What is
+seen of it from elsewhere is then what they happened to be. Where a second photograph, of another
+exposure or in another light, tells those of its neighbours, the border of what that one shows is an
+edge across a tooth. So the harmonics above the constant are made to change as little as they can
+from one Gaussian to the next, while every photograph's colours stay: a membrane, held where there
+are photographs. The constant is free, as neighbours may have any colour.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from pipeline.kernels import kernel
+from stages.fit.arrays import Array, Floats, Integers
+from stages.splatting.threads import KERNELS
+
+F = np.float32
+CHUNK = 256
+#: holds what neither a photograph nor a neighbour does
+LEAST = 1e-6
+#: the residual, squared, against what it was: float32 holds no less
+SOLVED = 1e-10
+
+
+@kernel(parallel=True)
+def _stretched(move: Floats, grams: Floats, neighbours: Integers, starts: Integers, out: Floats):  # type: ignore[no-untyped-def]
+    """What the membrane and the photographs pull back with: [N, K, 3] of moves [N, K, 3]."""
+    number, terms, _ = move.shape
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            degree = F(starts[i + 1] - starts[i])
+            for k in range(terms):
+                for c in range(3):
+                    total = F(LEAST) * move[i, k, c]
+                    for other in range(terms):
+                        total += grams[i, k, other] * move[i, other, c]
+                    out[i, k, c] = total + (degree * move[i, k, c] if k > 0 else F(0))
+            for edge in range(starts[i], starts[i + 1]):
+                j = neighbours[edge]
+                for k in range(1, terms):
+                    for c in range(3):
+                        out[i, k, c] -= move[j, k, c]
+
+
+@kernel(parallel=True)
+def _times(blocks: Floats, values: Floats, out: Floats):  # type: ignore[no-untyped-def]
+    """Each of [N, K, K] times each of [N, K, 3]."""
+    number, terms, _ = values.shape
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            for k in range(terms):
+                for c in range(3):
+                    total = F(0)
+                    for other in range(terms):
+                        total += blocks[i, k, other] * values[i, other, c]
+                    out[i, k, c] = total
+
+
+def spread(
+    harmonics: Floats, basis: Array, pixels: Array, neighbours: Integers, starts: Integers,
+    firmness: float, steps: int,
+) -> Floats:  # fmt: skip
+    """Harmonics that turn like those beside them where no photograph says how.
+
+    Conjugate gradients (Hestenes and Stiefel 1952) on the membrane's normal equations, with the
+    inverse of each Gaussian's own block for a preconditioner.
+
+    Args:
+        harmonics: [N, K, 3] coefficients, the constant first.
+        basis: [V, N, K] what each of them adds to what each view sees.
+        pixels: [V, N] of each view that a Gaussian colours.
+        neighbours, starts: who is beside whom (see `total_variation.connected`).
+        firmness: what a pixel counts against a neighbour.
+        steps: of conjugate gradients.
+
+    Returns:
+        [N, K, 3] float32.
+    """
+    terms = harmonics.shape[1]
+    start = np.ascontiguousarray(harmonics, np.float32)
+    seen = np.ascontiguousarray(np.moveaxis(basis, 0, 1), np.float64)  # [N, V, K]
+    grams = np.swapaxes(seen * (firmness * pixels.T)[:, :, None], 1, 2) @ seen
+    own = grams + LEAST * np.eye(terms)
+    own[:, range(1, terms), range(1, terms)] += np.diff(starts)[:, None]
+    blocks = np.linalg.inv(own).astype(np.float32)
+    grams = grams.astype(np.float32)
+    pull, better = np.empty_like(start), np.empty_like(start)
+    with KERNELS:
+        _stretched(start, np.zeros_like(grams), neighbours, starts, pull)
+        rest = F(LEAST) * start - pull
+        _times(blocks, rest, better)
+        direction, move, now = better.copy(), np.zeros_like(start), _product(rest, better)
+        enough = SOLVED * now
+        for _ in range(steps):
+            if now <= enough:
+                break
+            _stretched(direction, grams, neighbours, starts, pull)
+            length = F(now / _product(direction, pull))
+            move += length * direction
+            rest -= length * pull
+            _times(blocks, rest, better)
+            before, now = now, _product(rest, better)
+            direction = better + F(now / before) * direction
+    return np.asarray(start + move, np.float32)
+
+
+def _product(a: Floats, b: Floats) -> float:
+    return float((a * b).sum(dtype=np.float64))
