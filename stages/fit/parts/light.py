@@ -88,10 +88,11 @@ class Light(
         light_evidence: Share = 0.7
         """on a held surface there is a light if its shading lowers the error of predicting the
         photographs from one another to this share"""
-        light_unexplained: Share = 0.075
-        """and if it leaves no more error than this (mean, 0..1). A light that is there leaves .045
-        to .067; photographs of which each had a light, an exposure and a white balance of its own
-        .08 to .09 where the share says yes, and with a light these look worse from anywhere"""
+        light_unexplained: Share = 0.07
+        """and if it leaves no more error than this (mean, 0..1). A light that is there leaves .037
+        to .067 (samples, scan video, generated mouths); photographs of which each had a flash, an
+        exposure and a white balance of its own .076 to .1 where the share says yes, and with a
+        light these look worse from anywhere"""
 
     def __init__(self, fit: Trainer) -> None:
         from stages.splatting.adam import Adam
