@@ -7,7 +7,7 @@ Each workspace is of three photographs, run up to `sap`. Cameras and surface are
 colours are fitted to two of them, at about half size. Compared is what the third shows of surface
 that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
 other truth: this is the one figure of unseen views that they give. --set says a setting of the fit
-anew: `--set headlight=0.6 --set headlight_shoulder=0`.
+anew: `--set headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pipeline.artifacts import GROUP as ARTIFACTS
 from pipeline.artifacts import KINDS, Artifact, artifact_class, kinds
 from pipeline.errors import RequestError, nearest, shown
+from pipeline.measure import usable_cores
 from pipeline.plugins import Entries, check_name, load, registered
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ class LocalContext(StageContext):
     inputs: Mapping[str, Artifact] = field(default_factory=dict)
     sources: Mapping[str, Path] = field(default_factory=dict)
     seed: int = 0
-    threads: int = field(default_factory=lambda: os.cpu_count() or 1)
+    threads: int = field(default_factory=usable_cores)
     figures: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     on_progress: Callable[..., None] | None = None

@@ -17,7 +17,7 @@ from stages.fit.inputs.initial import SH_C0, camera_share, facing, headlight_har
 from stages.fit.inputs.scene import Scene
 from stages.fit.numerics.light import prediction_errors
 from stages.fit.parts.light import Light
-from stages.splatting.harmonics import harmonics
+from stages.splatting.harmonics import seen_from
 from stages.splatting.kernels.projection import HARMONICS
 
 if TYPE_CHECKING:
@@ -126,8 +126,7 @@ def harmonics_for_viewers(fit: Trainer, cameras: Sequence[Camera]) -> Floats:
     for view, target in enumerate(fit.targets):
         viewpoint = fit.viewpoint(view, target[1])
         part.shade(packed, viewpoint)
-        rays = positions - viewpoint.centre
-        basis = harmonics(rays / np.linalg.norm(rays, axis=1, keepdims=True))[:, :terms]
+        basis = seen_from(viewpoint.centre, positions)[:, :terms]
         gram += basis[:, :, None] * basis[:, None, :]
         # the kernels' constant harmonic
         wanted += basis[:, :, None] * (SH_C0 * packed[:, None, HARMONICS:])

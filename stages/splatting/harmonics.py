@@ -27,3 +27,9 @@ def harmonics(directions: npt.NDArray[np.floating]) -> Array:
         ],
         axis=1,
     )  # fmt: skip
+
+
+def seen_from(centre: npt.NDArray[np.floating], positions: npt.NDArray[np.floating]) -> Array:
+    """The 16 harmonics of Gaussians at positions [N, 3], as a camera at `centre` [3] sees them."""
+    rays = np.asarray(positions, np.float64) - centre
+    return harmonics(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
 from stages.fit.inputs.initial import Cloud, initial_gaussians
-from stages.fit.stage import FitConfig
+from stages.fit.stage import FitConfig, FitStage
 from stages.splatting import render
 from stages.splatting.rasterizer import unpack
 
@@ -77,3 +78,15 @@ def outputs(folder) -> dict[str, bytes]:
 
 class StoppedError(Exception):
     pass
+
+
+def run_until(here: LocalContext, iteration: int) -> None:
+    """Run a fit that is stopped once it says that so many iterations are done."""
+
+    def stop(step: str, done: int, total: int, **figures: object) -> None:
+        if step == "fit" and done >= iteration:
+            raise StoppedError
+
+    here.on_progress = stop
+    with pytest.raises(StoppedError):
+        FitStage().run(here)

@@ -10,7 +10,7 @@ from stages.fit import numerics
 from stages.fit.stage import FitStage
 from stages.splatting.harmonics import harmonics
 from stages.splatting.rasterizer import use_threads
-from tests.stages.fit_case import StoppedError
+from tests.stages.fit_case import run_until
 from tests.stages.lit_fit_case import case, context
 
 
@@ -129,14 +129,7 @@ def test_a_stopped_fit_with_it_resumes_to_the_same_bytes(tmp_path) -> None:
     plain = context(tmp_path / "b", few, cameras, points, threads=1, harmonics_at=0.0, **config)
     FitStage().run(plain)
     stopped = context(tmp_path / "c", few, cameras, points, checkpoint_every=4, **config)
-
-    def stop(step: str, done: int, total: int, **figures: object) -> None:
-        if step == "fit" and done >= 20:
-            raise StoppedError
-
-    stopped.on_progress = stop
-    with pytest.raises(StoppedError):
-        FitStage().run(stopped)
+    run_until(stopped, 20)
     again = context(tmp_path / "c", few, cameras, points, **config)
     FitStage().run(again)
     found, without, resumed = (c.result("gaussians").sh for c in (whole, plain, again))

@@ -10,7 +10,7 @@ import pytest
 from pipeline.artifacts.views import View, Views
 from stages.fit.stage import FitStage
 from stages.splatting import render
-from tests.stages.fit_case import StoppedError
+from tests.stages.fit_case import run_until
 from tests.stages.lit_fit_case import HEIGHT, WIDTH, case, context, lit_image, looking
 
 
@@ -107,14 +107,7 @@ def test_a_stopped_lit_fit_resumes_to_the_same_bytes(tmp_path) -> None:
     whole = context(tmp_path / "a", views, cameras, points, threads=1, **config)
     FitStage().run(whole)
     stopped = context(tmp_path / "b", views, cameras, points, checkpoint_every=7, **config)
-
-    def stop(step, done, total, **figures):
-        if step == "fit" and done >= 30:
-            raise StoppedError
-
-    stopped.on_progress = stop
-    with pytest.raises(StoppedError):
-        FitStage().run(stopped)
+    run_until(stopped, 30)
     again = context(tmp_path / "b", views, cameras, points, **config)
     FitStage().run(again)
     assert again.figures == whole.figures

@@ -1,8 +1,9 @@
-"""A batch of four small real cases for the tests of clusters, and patience."""
+"""For the tests of clusters: the recipes of docs/batch.md, four small real cases, and patience."""
 
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import time
 from collections.abc import Callable
@@ -10,8 +11,15 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "batch.md"
 #: Small settings: what is tested is the way to the cluster and back.
 SETTINGS = ("--stages", "views,teeth", "--set", "views.long_side=256", "--set", "report=false")
+
+
+def block(language: str) -> str:
+    """The block of a language on the page."""
+    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    return str(found)
 
 
 def write_cases(folder: Path) -> None:

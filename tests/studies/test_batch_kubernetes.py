@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.studies.small_batch import ROOT, SETTINGS, summary, wait_for, write_cases
+from tests.studies.small_batch import ROOT, SETTINGS, block, summary, wait_for, write_cases
 
 pytest.importorskip("distributed")
 kubernetes = pytest.importorskip("dask_kubernetes", reason="needs dask-kubernetes (make clusters)")
@@ -30,8 +30,7 @@ SERVICE = "dentalsplat-scheduler.default.svc.cluster.local"
 
 @pytest.fixture(scope="module")
 def manifest() -> dict[str, Any]:
-    (found,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "batch.md").read_text(), re.DOTALL)
-    return dict(yaml.safe_load(found))
+    return dict(yaml.safe_load(block("yaml")))
 
 
 def test_the_operators_schema_takes_the_manifest(manifest: dict[str, Any]) -> None:

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "batch.md"
-
-
-def block(language: str) -> str:
-    """The block of a language on the page."""
-    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    return str(found)
+from tests.studies.small_batch import PAGE, block
 
 
 def test_the_slurm_job_has_one_slot_and_four_cores(capsys: pytest.CaptureFixture[str]) -> None:

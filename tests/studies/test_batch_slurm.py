@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import getpass
 import os
-import re
 import shutil
 import signal
 import socket
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.small_batch import ROOT, SETTINGS, summary, wait_for, write_cases
+from tests.studies.small_batch import ROOT, SETTINGS, block, summary, wait_for, write_cases
 
 pytest.importorskip("dask_jobqueue")
 if not all(map(shutil.which, ("slurmctld", "slurmd", "sbatch", "scancel"))):
@@ -83,7 +82,7 @@ def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def recipe(folder: Path) -> str:
     """The program on the page, with this environment's Python and the test's folders."""
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "batch.md").read_text(), re.S)
+    code = block("python")
     for there, here in (
         ('"/shared/dentalsplat/.venv/bin/python"', repr(sys.executable)),
         ('"pipeline",', f"{sys.executable!r}, '-m', 'dentalsplat',"),

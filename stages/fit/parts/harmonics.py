@@ -37,7 +37,7 @@ class Harmonics(Part, switch="harmonics_at", on=0.3, off=0.0):
             self._spread(fit)
 
     def _spread(self, fit: Trainer) -> None:
-        from stages.splatting.harmonics import harmonics
+        from stages.splatting.harmonics import seen_from
         from stages.splatting.kernels.projection import HARMONICS
 
         packed = fit.packed
@@ -49,9 +49,8 @@ class Harmonics(Part, switch="harmonics_at", on=0.3, off=0.0):
         for view, target in enumerate(fit.targets):
             mask = target[factor].colour.mask
             pixels.append(contribution(fit.render(view, factor), mask, mask)[1])
-            rays = packed[:, :3] - fit.viewpoint(view, target[factor]).centre
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            basis.append(harmonics(rays)[:, :terms])
+            centre = fit.viewpoint(view, target[factor]).centre
+            basis.append(seen_from(centre, packed[:, :3])[:, :terms])
         near = numerics.total_variation.connected(packed[:, :3], NEIGHBOURS)
         found = numerics.harmonics.spread(
             packed[:, HARMONICS:].reshape(number, terms, 3), np.array(basis), np.array(pixels),
