@@ -52,8 +52,8 @@ class Basics(PartSettings):
 
     backend: Literal["auto", "cpu", "gsplat"] = "auto"
     """what draws the Gaussians in every step: our kernels on the processor, which give the same
-    bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one and it gives the
-    same images and gradients in a first trial)"""
+    bytes every time, or gsplat on an NVIDIA card (auto: a card, if there is one that gives the same
+    images and gradients in a first trial, for a fit long enough to make up for its start)"""
     iterations: AutoInt = automatic({3: 400, 6: 500, 12: 600, 24: 700}, held=200, ge=1)
     """optimiser steps, one view each"""
     # on a held surface geometry can't overfit, and more points carry more detail

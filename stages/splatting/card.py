@@ -15,9 +15,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from stages.splatting import reference
 from stages.splatting.kernels.projection import HARMONICS
 from stages.splatting.rasterizer import Viewpoint
-from stages.splatting.reference import colours, project
 from stages.splatting.torch_api import Backend, rasterization
 
 Array = npt.NDArray[np.float64]
@@ -50,13 +50,13 @@ class CardRendering:
         """Gradients of all inputs; see `rasterizer.Rendering.backward`."""
         images, alphas = self._outputs
         given = [
-            torch.from_numpy(np.ascontiguousarray(d_planes)).to(images).permute(1, 2, 0)[None],
-            -torch.from_numpy(np.ascontiguousarray(d_transmittance)).to(alphas)[None, ..., None],
+            _sent(d_planes, images.device).permute(1, 2, 0)[None],
+            -_sent(d_transmittance, alphas.device)[None, ..., None],
         ]
         torch.autograd.backward([images, alphas], given)
         found = {name: _array(_gradient(leaf)) for name, leaf in self._leaves.items()}
         return CardGradients(
-            packed=found["packed"].astype(np.float32),
+            packed=found["packed"],
             pose=found["twist"].astype(np.float64),
             next_pose=found["next_twist"].astype(np.float64),
             centres=_array(_gradient(self._centres)).reshape(-1, 2),
@@ -83,7 +83,7 @@ def rasterize_on_card(
         backend: of `torch_api.rasterization`.
     """
     leaves = {
-        "packed": torch.from_numpy(packed).to(device).clone(),
+        "packed": _sent(packed, torch.device(device)),
         "twist": torch.zeros(6, device=device),
         "next_twist": torch.zeros(6, device=device),
     }
@@ -93,15 +93,15 @@ def rasterize_on_card(
     means, sh = scene[:, :3], scene[:, HARMONICS:].reshape(len(scene), -1, 3)
     pose = _moved(viewpoint, leaves["twist"])
     intrinsics = torch.from_numpy(viewpoint.intrinsics).to(device)
-    features = [colours(means, sh, pose, degree)]
-    _, centres, z = project(means, pose, intrinsics, near)
+    features = [_colours(means, sh, pose, degree, backend)]
+    if depth or flow_to is not None:
+        _, centres, z = reference.project(means, pose, intrinsics, near)
     if depth:
         features.append(z[:, None])
     if flow_to is not None:
         further = torch.from_numpy(flow_to.intrinsics).to(device)
-        features.append(
-            project(means, _moved(flow_to, leaves["next_twist"]), further, near)[1] - centres
-        )
+        there = _moved(flow_to, leaves["next_twist"])
+        features.append(reference.project(means, there, further, near)[1] - centres)
     fx, fy, cx, cy = viewpoint.intrinsics.tolist()
     images, alphas, meta = rasterization(
         means, scene[:, 3:7], scene[:, 7:10].exp(), scene[:, 10].sigmoid(),
@@ -112,11 +112,21 @@ def rasterize_on_card(
     meta["means2d"].retain_grad()
     radii = meta["radii"].detach().reshape(len(scene), -1)
     return CardRendering(
-        planes=np.ascontiguousarray(_array(images)[0].transpose(2, 0, 1)),
-        transmittance=np.ascontiguousarray(1 - _array(alphas)[0, ..., 0]),
-        visible=np.asarray(_array(radii > 0).all(axis=1)),
+        planes=_array(images[0].permute(2, 0, 1)),
+        transmittance=_array(1 - alphas[0, ..., 0]),
+        visible=_array((radii > 0).all(dim=1)),
         _leaves=leaves, _outputs=(images, alphas), _centres=meta["means2d"],
     )  # fmt: skip
+
+
+def _colours(means: Tensor, sh: Tensor, pose: Tensor, degree: int, backend: Backend) -> Tensor:
+    """[N, 3] of harmonics [N, K, 3] towards a camera; by gsplat in one kernel for a hundred."""
+    if backend != "gsplat":
+        return reference.colours(means, sh, pose, degree)
+    from gsplat import spherical_harmonics
+
+    directions = means + pose[:3, :3].T @ pose[:3, 3]
+    return (spherical_harmonics(degree, directions, sh) + 0.5).clamp(min=0)
 
 
 def _moved(viewpoint: Viewpoint, twist: Tensor) -> Tensor:
@@ -140,5 +150,16 @@ def _gradient(tensor: Tensor) -> Tensor:
     return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
 
 
+def _sent(array: npt.NDArray[Any], device: torch.device) -> Tensor:
+    """A copy of an array on the device."""
+    here = torch.from_numpy(np.ascontiguousarray(array))
+    return here.clone() if device.type == "cpu" else here.pin_memory().to(device, non_blocking=True)
+
+
 def _array(tensor: Tensor) -> npt.NDArray[Any]:
-    return tensor.detach().cpu().numpy()
+    """What a tensor holds, contiguous, in memory that the card writes to by itself (pinned)."""
+    held = tensor.detach().contiguous()
+    if held.device.type == "cpu":
+        return np.asarray(held.numpy())
+    fetched = torch.empty(held.shape, dtype=held.dtype, pin_memory=True)
+    return np.asarray(fetched.copy_(held).numpy())
