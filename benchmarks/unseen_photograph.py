@@ -6,7 +6,8 @@
 Each workspace is of three photographs, run up to `sap`. Cameras and surface are those of all three;
 colours are fitted to two of them, at about half size. Compared is what the third shows of surface
 that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
-other truth: this is the one figure of unseen views that they give. --set says a setting of the fit
+other truth: this is the one figure of unseen views that they give. What is a hole in the render
+counts as black: it hides nothing to leave it out. --set says a setting of the fit
 anew: `--set headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
 """
 
@@ -40,8 +41,8 @@ POINTS, WIDTH = 40_000, 700
 #: How far a point may lie from what a photograph shows (a share of the depth), least cosine of a
 #: good look at it, and what counts for one at more of a slant: some colour is better than none.
 TOLERANCE, LEAST_COSINE, SLANTED = 0.01, 0.3, 0.05
-#: Compared is where the render is at least this solid; gains are found below this brightness.
-SOLID, BRIGHT = 0.9, 0.97
+#: Gains are found below this brightness.
+BRIGHT = 0.97
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def predict(workspace: Path, view: int, settings: FitConfig) -> Prediction:
     image = np.clip(trainer.composited(None, drawn), 0, 1)
     shown = target.colour.target
     small = cv2.resize(mask.astype(np.uint8), shown.shape[:0:-1], interpolation=cv2.INTER_NEAREST)
-    compared = (small > 0) & (1 - drawn.transmittance > SOLID)
+    compared = small > 0
     ratios = [
         (shown[c] / np.maximum(image[c], 0.02))[compared & (shown[c] < BRIGHT)] for c in range(3)
     ]

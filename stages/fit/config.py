@@ -19,7 +19,7 @@ from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
 from stages.fit.parts.progressive import Progressive
 from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
-from stages.fit.parts.surface import Surface, Warp
+from stages.fit.parts.surface import Lining, Surface, Warp
 from stages.fit.settings import (
     AUTO,
     PIXELS,
@@ -37,13 +37,13 @@ from stages.fit.settings import (
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
     Progressive, Filling, Shading, Saturation, Coarse, Extension, Harmonics, Detail, Exposure,
-    Background, Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Poses, Focal,
-    Density, Floaters, Colours,
+    Background, Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Lining, Poses,
+    Focal, Density, Floaters, Colours,
 )  # fmt: skip
 PartName = Literal[
     "background", "coarse", "colours", "density", "depth", "detail", "exposure", "extension",
-    "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "mcmc", "poses",
-    "progressive", "saturation", "shading", "surface", "variation", "warp",
+    "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "lining", "mcmc",
+    "poses", "progressive", "saturation", "shading", "surface", "variation", "warp",
 ]  # fmt: skip
 
 
@@ -100,9 +100,9 @@ class Basics(PartSettings):
 class FitConfig(
     Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings,
     Density.Settings, Detail.Settings, Harmonics.Settings, Warp.Settings, Surface.Settings,
-    Isotropic.Settings, Focal.Settings, Progressive.Settings, Poses.Settings, Extension.Settings,
-    Coarse.Settings, Variation.Settings, Depth.Settings, Flow.Settings, Light.Settings,
-    Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
+    Lining.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings, Poses.Settings,
+    Extension.Settings, Coarse.Settings, Variation.Settings, Depth.Settings, Flow.Settings,
+    Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 

@@ -34,6 +34,13 @@ if TYPE_CHECKING:
 #: up to so many views, a surface can be held: at four, holding cost .2 to 1.5 dB on two generated
 #: mouths and a scan, at five it gained .2 to .4 on the mouths
 FEW_VIEWS = 3
+#: how far behind a surface its lining is, in standard deviations of the Gaussian before it: at 1.5
+#: it shines through (two patients .2 dB), 2 to 3.5 do the same
+BEHIND = 2.5
+#: how many times as wide it is, for every one of those that is lined: neighbours overlap
+WIDTH = 2.0
+#: and so many of its own from where the surface ends, or it would be seen beyond
+CLEAR = 2.0
 #: what ``warp_slope: auto`` comes to, with a light beside the lens and without
 SLOPE_LIT, SLOPE = 2.0, 0.3
 
@@ -99,9 +106,59 @@ class Surface(
         for column in (6, 8):
             self.anchor[rows, column] += np.float32(np.log(factor))
 
+    def recede(self, first: int, move: Floats, wider: float) -> None:
+        """Gaussians from row `first` on belong by [N - first, 3] elsewhere, and may be wider."""
+        self.anchor[first:, :3] += move
+        self.anchor[first:, 8] += np.float32(wider)
+
     def select(self, source: Indices, fresh: Bools) -> None:
         self.anchor = np.ascontiguousarray(self.anchor[source])
         self.turn = np.ascontiguousarray(self.turn[source])
+
+
+class Lining(Part, switch="lining", on=0.25, off=0.0, needs=("cloud",)):
+    """Few, wide Gaussians behind a held surface, so that no black shows between those on it.
+
+    A photograph fills what is between Gaussians narrower than its pixels, by the low-pass that all
+    are drawn with, and black behind them is the cheapest way to a dark line. Both open where the
+    scene is looked at from nearer than the photograph was taken, or from elsewhere: black cracks.
+    What lines them has about their colour. It follows the photographs as all Gaussians do, and
+    what nothing lets through is pruned in the end.
+
+    Twelve patients at 512 px (mean, standard error): drawn twice as large 36.1 dB, not 33.2 (.2);
+    each photograph from the other two .32 dB better (.04); the photographs themselves .8 (.3).
+    """
+
+    class Settings(PartSettings):
+        lining: AutoFloat = automatic({3: 0.0}, held=0.25, le=1)
+        """where a surface is held and there is no light, the share of its Gaussians that get one
+        more behind them, so that no black shows between them from nearer or elsewhere; 0: none"""
+
+    @classmethod
+    def of(cls, fit: Trainer) -> Part | None:
+        # under a light they come out grey: colours that nothing tells well, on a scan -.23 dB
+        return super().of(fit) if fit.settings.hold_surface and not fit.lit else None
+
+    def begin(self, fit: Trainer) -> None:
+        if fit.iteration:
+            return
+        surface = fit.find(Surface)
+        assert surface is not None
+        every = round(1 / self.settings.lining)
+        wider = float(np.log(WIDTH * np.sqrt(every)))
+        chosen = numerics.surface.inland(
+            fit.packed[:, :3].astype(np.float64), surface.anchor[:, 3:6].astype(np.float64),
+            CLEAR * np.exp(wider + fit.packed[:, 7:10].max(1)), every,
+        )  # fmt: skip
+        number = len(fit.packed)
+        source = np.concatenate([np.arange(number), chosen])
+        packed = fit.packed[source]
+        scales = packed[number:, 7:10]
+        move = -BEHIND * np.exp(scales.max(1, keepdims=True)) * surface.anchor[chosen, 3:6]
+        packed[number:, :3] += move
+        scales += np.float32(wider) * (np.arange(3) != scales.argmin(1)[:, None])
+        fit.replace(packed, source, np.arange(len(source)) >= number)
+        surface.recede(number, move, wider)
 
 
 class Warp(
