@@ -12,7 +12,7 @@ from pipeline.artifacts.views import Views
 from stages.fit.config import FitConfig, resolve
 from stages.fit.inputs.scene import prepare
 from stages.fit.numerics.surface import inland, rim
-from stages.fit.parts.surface import BEHIND, WIDTH, Surface
+from stages.fit.parts.surface import BEHIND, CLEAR, WIDTH, Surface
 from stages.fit.stage import FitStage
 from stages.splatting import render
 from tests.stages.fit_case import run_until
@@ -82,15 +82,36 @@ def test_where_a_surface_ends_is_found() -> None:
     assert found[away < 0.4].mean() > 0.9 and not found[away > 2.5].any()
 
 
-def test_nothing_is_lined_near_the_end() -> None:
+def test_how_far_the_end_is() -> None:
     positions, normals = sheet()
-    chosen = inland(positions, normals, np.full(len(positions), 4.0), 3)
-    away = from_the_end(positions)
-    assert away[chosen].min() > 3.5
-    assert len(chosen) == pytest.approx((away > 4.3).sum() / 3, rel=0.15)
+    chosen, distance = inland(positions, normals, 3)
+    assert np.array_equal(chosen, np.arange(len(positions))[::3])
+    away = from_the_end(positions)[chosen]
+    assert np.abs(distance - away)[away > 1].max() < 1.2
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(2000)
+    z = np.linspace(-1, 1, 2000)
+    ball = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
+    assert np.isinf(inland(ball, ball, 1)[1]).all()
     normals[::2] = 0  # half of them are no surface
-    assert np.isin(inland(positions, normals, np.full(len(positions), 4.0), 1) % 2, 1).all()
-    assert len(inland(positions[:20], normals[:20], np.ones(20), 1)) == 0
+    assert (inland(positions, normals, 1)[0] % 2).all()
+    assert len(inland(positions[:20], normals[:20], 1)[0]) == 0
+
+
+def test_it_never_gets_so_wide_that_it_is_seen_past_the_end() -> None:
+    fit = trainer(lining=0.25)
+    number, positions = len(fit.packed), fit.packed[:, :3].astype(float)
+    for part in fit.parts:
+        part.begin(fit)
+    surface = fit.find(Surface)
+    ends = positions[rim(positions, surface.anchor[:number, 3:6].astype(float))]
+    _, at = cKDTree(fit.packed[:number, 11:]).query(fit.packed[number:, 11:])
+    distance, _ = cKDTree(ends).query(positions[at])
+    for _ in range(3):
+        fit.packed[number:, 7:9] += 1.0
+        surface.follow(fit, None)
+    width = np.exp(fit.packed[number:, 7:10].max(1))
+    assert (CLEAR * width < 1.01 * distance).all()
+    assert width.max() > 1.5 * width.min()
 
 
 def test_no_black_shows_from_nearer(tmp_path) -> None:

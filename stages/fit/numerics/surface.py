@@ -32,7 +32,7 @@ from stages.splatting.threads import KERNELS, workers
 F = np.float32
 #: a point is on the rim if the mean of so many neighbours is aside by this share of the distance to
 #: the furthest of them: .42 on a straight edge, and 0 with a spread of .06 where there is none
-RIM_NEIGHBOURS, RIM_ASIDE = 32, 0.25
+RIM_NEIGHBOURS, RIM_ASIDE = 32, 0.3
 
 
 @dataclass(frozen=True)
@@ -57,20 +57,20 @@ def rim(positions: Array, normals: Array) -> Bools:
     return np.asarray(np.linalg.norm(aside, axis=1) > RIM_ASIDE * distance[:, -1])
 
 
-def inland(positions: Array, normals: Array, clear: Array, every: int) -> Indices:
-    """Every so many points of a surface [N, 3] that are further than `clear` [N] from its end.
+def inland(positions: Array, normals: Array, every: int) -> tuple[Indices, Array]:
+    """Every so many points of a surface [N, 3], and how far from its end each is.
 
     Points without a normal (0) are no surface. Points come in the order of their places: every so
     many of them lie evenly.
     """
     known = np.flatnonzero(np.abs(normals).sum(1) > 0)
     if len(known) <= RIM_NEIGHBOURS:
-        return known[:0]
+        return known[:0], np.empty(0)
     chosen, ends = known[::every], rim(positions[known], normals[known])
     if not ends.any():
-        return chosen
+        return chosen, np.full(len(chosen), np.inf)
     distance, _ = cKDTree(positions[known[ends]]).query(positions[chosen], workers=workers())
-    return np.asarray(chosen[distance > clear[chosen]])
+    return chosen, np.asarray(distance)
 
 
 class Warp:

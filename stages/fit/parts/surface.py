@@ -39,7 +39,7 @@ FEW_VIEWS = 3
 BEHIND = 2.5
 #: how many times as wide it is, for every one of those that is lined: neighbours overlap
 WIDTH = 2.0
-#: and so many of its own from where the surface ends, or it would be seen beyond
+#: and at least so many of its own from where the surface ends, or it would be seen beyond
 CLEAR = 2.0
 #: what ``warp_slope: auto`` comes to, with a light beside the lens and without
 SLOPE_LIT, SLOPE = 2.0, 0.3
@@ -106,10 +106,11 @@ class Surface(
         for column in (6, 8):
             self.anchor[rows, column] += np.float32(np.log(factor))
 
-    def recede(self, first: int, move: Floats, wider: float) -> None:
-        """Gaussians from row `first` on belong by [N - first, 3] elsewhere, and may be wider."""
+    def recede(self, first: int, move: Floats, widest: Floats) -> None:
+        """Gaussians from row `first` on belong by [N - first, 3] elsewhere, and may be so wide (log
+        standard deviation)."""
         self.anchor[first:, :3] += move
-        self.anchor[first:, 8] += np.float32(wider)
+        self.anchor[first:, 8] = widest
 
     def select(self, source: Indices, fresh: Bools) -> None:
         self.anchor = np.ascontiguousarray(self.anchor[source])
@@ -145,20 +146,24 @@ class Lining(Part, switch="lining", on=0.25, off=0.0, needs=("cloud",)):
         surface = fit.find(Surface)
         assert surface is not None
         every = round(1 / self.settings.lining)
-        wider = float(np.log(WIDTH * np.sqrt(every)))
-        chosen = numerics.surface.inland(
-            fit.packed[:, :3].astype(np.float64), surface.anchor[:, 3:6].astype(np.float64),
-            CLEAR * np.exp(wider + fit.packed[:, 7:10].max(1)), every,
-        )  # fmt: skip
+        wider = np.float32(np.log(WIDTH * np.sqrt(every)))
+        chosen, inland = numerics.surface.inland(
+            fit.packed[:, :3].astype(np.float64), surface.anchor[:, 3:6].astype(np.float64), every
+        )
+        # no photograph would draw them back from beyond the rim
+        most = np.log(np.maximum(inland, 1e-9) / CLEAR).astype(np.float32)
+        fits = fit.packed[chosen, 7:10].max(1) + wider < most
+        chosen, most = chosen[fits], most[fits]
         number = len(fit.packed)
         source = np.concatenate([np.arange(number), chosen])
         packed = fit.packed[source]
         scales = packed[number:, 7:10]
         move = -BEHIND * np.exp(scales.max(1, keepdims=True)) * surface.anchor[chosen, 3:6]
         packed[number:, :3] += move
-        scales += np.float32(wider) * (np.arange(3) != scales.argmin(1)[:, None])
+        scales += wider * (np.arange(3) != scales.argmin(1)[:, None])
+        widest = np.minimum(surface.anchor[chosen, 8] + wider, most)
         fit.replace(packed, source, np.arange(len(source)) >= number)
-        surface.recede(number, move, wider)
+        surface.recede(number, move, widest)
 
 
 class Warp(
