@@ -10,9 +10,9 @@ from stages.fit import trial
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
 
-#: "auto" takes the card from so many steps times pixels on. An H100 took 8 s to start, and then over
-#: 200 steps of 1024 x 768 px, half of them at half size, .9 s less than 16 cores of its machine and
-#: 5.6 s less than 4: they are even at 1.4e9 and 2.2e8.
+#: "auto" takes the card from so many steps times pixels on. An H100 took 8 s to start, and then
+#: 200 steps of 1024 x 768 px, half of them at half size, in .9 s less than 16 cores of its machine
+#: and 5.6 s less than 4: they are even at 1.4e9 and 2.2e8.
 WORTHWHILE = 5e8
 
 
