@@ -7,8 +7,8 @@ Each workspace is of three photographs, run up to `sap`. Cameras and surface are
 colours are fitted to two of them, at about half size. Compared is what the third shows of surface
 that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
 other truth: this is the one figure of unseen views that they give. What is a hole in the render
-counts as black: it hides nothing to leave it out. --set says a setting of the fit
-anew: `--set headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
+counts as black: surface is known to be there. --set says a setting of the fit anew: `--set
+headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import workspaces
 import yaml
 
-from pipeline.store import Store
 from stages.fit.config import FitConfig, resolve
 from stages.fit.inputs.initial import Cloud
 from stages.fit.inputs.scene import Scene, prepare
@@ -67,16 +67,8 @@ class Prediction:
 
 def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
     """The scene of a workspace, the fit's settings, and the factor by which images are reduced."""
-    store = Store(workspace)
-
-    def loaded(stage: str, kind: str) -> Any:
-        result = store.in_use(stage)
-        if result is None:
-            raise SystemExit(f"{workspace} has no result of {stage}: run it up to sap first.")
-        return store.load(result, kind)
-
-    cameras = loaded("align", "cameras").by_name()
-    views = [view for view in loaded("init", "views").views if view.name in cameras]
+    cameras = workspaces.load(workspace, "align", "cameras").by_name()
+    views = [view for name, view in workspaces.views(workspace).items() if name in cameras]
     if len(views) != 3:
         raise SystemExit(f"{workspace}: {len(views)} photographs are placed, three are needed.")
     factor = 1
@@ -87,7 +79,9 @@ def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
         len(views) - 1, 0, True,
     )  # fmt: skip
     cameras_in_order = [cameras[view.name] for view in views]
-    scene = prepare(views, cameras_in_order, loaded("sap", "points"), None, resolved)
+    scene = prepare(
+        views, cameras_in_order, workspaces.load(workspace, "sap", "points"), None, resolved
+    )
     return scene, resolved.but(coarse_fraction=0.0), factor
 
 

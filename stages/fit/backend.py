@@ -17,10 +17,11 @@ WORTHWHILE = 5e8
 
 
 def expected_backend(config: Any) -> str:
-    """What a fit with this `FitConfig` will run on here: ``"cpu"``, or gsplat on which card.
+    """What a fit with this `FitConfig` may run on here: ``"cpu"``, or gsplat on which card.
 
     A card that is out of order doesn't count, so that what the processor makes in its place is
-    never taken for the card's.
+    never taken for the card's. Which fits ``auto`` leaves to the processor beside a card their
+    size says, the same every time.
     """
     if config.backend == "cpu" or _not_on_a_card(config) is not None:
         return "cpu"

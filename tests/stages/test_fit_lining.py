@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -122,10 +120,7 @@ def test_no_black_shows_from_nearer(tmp_path) -> None:
         here = context(tmp_path / str(lining), few, cameras, points, lining=lining, **HELD)
         FitStage().run(here)
         camera = cameras.cameras[1]
-        near = replace(
-            camera, width=3 * camera.width, height=3 * camera.height, fx=3 * camera.fx,
-            fy=3 * camera.fy, cx=3 * camera.cx, cy=3 * camera.cy,
-        )  # fmt: skip
+        near = camera.resized(3 * camera.width, 3 * camera.height)
         alpha = render(here.result("gaussians"), near).alpha
         middle = alpha[near.height // 4 : -near.height // 4, near.width // 4 : -near.width // 4]
         darkest[lining] = np.quantile(middle, 0.01)

@@ -133,8 +133,8 @@ class Lining(Part, switch="lining", on=0.25, off=0.0, needs=("cloud",)):
 
     class Settings(PartSettings):
         lining: AutoFloat = automatic({3: 0.0}, held=0.25, le=1)
-        """where a surface is held and there is no light, the share of its Gaussians that get one
-        more behind them, so that no black shows between them from nearer or elsewhere; 0: none"""
+        """where a surface is held and there is no light, about the share of its Gaussians that get
+        one behind them, so that no black shows between them from nearer or elsewhere; 0: none"""
 
     @classmethod
     def of(cls, fit: Trainer) -> Part | None:
