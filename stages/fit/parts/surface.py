@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 FEW_VIEWS = 3
 #: how far behind a surface its lining is, in standard deviations of the Gaussian before it. 1.2 to
 #: 3.5 look the same, from 1.2 on down it shines through; the depth that is rendered lies .6 pixels
-#: of 512 px photographs further back by it, with 2.5 it was .9
+#: of 512 px photographs further back by it (2.5: .9), and on six generated mouths nearer the truth
 BEHIND = 1.8
 #: how many times as wide it is, for every one of those that is lined: neighbours overlap
 WIDTH = 2.0
