@@ -1,14 +1,19 @@
 """One of three photographs predicted from the other two: how well colours turn with the view.
 
     python benchmarks/unseen_photograph.py WORKSPACE ... [--left-out 0|1|2] [--set FIELD=VALUE ...]
-                                           [--pictures DIR] [--threads 2]
+                                           [--cut] [--pictures DIR] [--threads 2]
 
-Each workspace is of three photographs, run up to `sap`. Cameras and surface are those of all three;
+Each workspace is of three photographs, run up to `sap`: right, frontal, left. Cameras and surface
+are those of all three;
 colours are fitted to two of them, at about half size. Compared is what the third shows of surface
 that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
 other truth: this is the one figure of unseen views that they give. What is a hole in the render
 counts as black: surface is known to be there. --set says a setting of the fit anew: `--set
 headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
+
+With --cut only a part of it is left out, 40 % of what another one shows as well (of the frontal
+photograph on both sides, of the others towards the front teeth), and no gains are allowed: what
+lies beyond the border of a photograph should look from there as that photograph would show it.
 """
 
 from __future__ import annotations
@@ -41,6 +46,8 @@ POINTS, WIDTH = 40_000, 700
 #: How far a point may lie from what a photograph shows (a share of the depth), least cosine of a
 #: good look at it, and what counts for one at more of a slant: some colour is better than none.
 TOLERANCE, LEAST_COSINE, SLANTED = 0.01, 0.3, 0.05
+#: What --cut leaves of the columns of what others show, from and to which share of it.
+LEFT = ((0.0, 0.6), (0.2, 0.8), (0.4, 1.0))
 #: Gains are found below this brightness.
 BRIGHT = 0.97
 
@@ -50,13 +57,13 @@ class Prediction:
     """Attributes:
     shown: [3, H, W] the photograph that was left out; predicted: the same, with the gains.
     compared: [H, W] where.
-    gains: [3] of the channels.
+    gains: [3] of the channels, or None.
     """
 
     shown: Floats
     predicted: Floats
     compared: Bools
-    gains: Array
+    gains: Array | None
 
     @property
     def psnr(self) -> float:
@@ -65,10 +72,18 @@ class Prediction:
         return float(-10 * np.log10((error.astype(np.float64) ** 2).mean()))
 
 
-def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
-    """The scene of a workspace, the fit's settings, and the factor by which images are reduced."""
+def read_scene(
+    workspace: Path, settings: FitConfig, shown: int, masks: dict[str, Bools] | None = None
+) -> tuple[Scene, Any, int]:
+    """The scene of a workspace, the fit's settings, and the factor by which images are reduced.
+
+    Args:
+        shown: photographs that the fit will have.
+        masks: by name, in place of the views' own.
+    """
     cameras = workspaces.load(workspace, "align", "cameras").by_name()
     views = [view for name, view in workspaces.views(workspace).items() if name in cameras]
+    views = [replace(view, mask=(masks or {}).get(view.name, view.mask)) for view in views]
     if len(views) != 3:
         raise SystemExit(f"{workspace}: {len(views)} photographs are placed, three are needed.")
     factor = 1
@@ -76,7 +91,7 @@ def read_scene(workspace: Path, settings: FitConfig) -> tuple[Scene, Any, int]:
         factor *= 2
     resolved = resolve(
         settings.model_copy(update={"coarse_factor": max(factor, 2), "coarse_fraction": 0.5}),
-        len(views) - 1, 0, True,
+        shown, 0, True,
     )  # fmt: skip
     cameras_in_order = [cameras[view.name] for view in views]
     scene = prepare(
@@ -136,29 +151,50 @@ def seen_elsewhere(scene: Scene, seen: list[Sight], view: int) -> Bools:
     return (good > 0) & (cv2.dilate(bad, np.ones((3, 3))) == 0) & photo.valid()
 
 
-def predict(workspace: Path, view: int, settings: FitConfig) -> Prediction:
-    """Fit two photographs and look from where the third was taken."""
-    scene, resolved, factor = read_scene(workspace, settings)
-    others = [k for k in range(len(scene.views)) if k != view]
+def predict(workspace: Path, view: int, settings: FitConfig, cut: bool) -> Prediction:
+    """Fit two photographs, or what is left of three, and look from where the other was taken."""
+    shown = 3 if cut else 2
+    scene, resolved, factor = read_scene(workspace, settings, shown)
+    target = scene.targets[view][factor]
     seen = sights(scene)
     mask = seen_elsewhere(scene, seen, view)
-    rest = replace(scene, cloud=coloured(scene, seen, others)).reduced(factor).without([view])
-    trainer = rest.trainer(resolved, settings.light == "camera")
+    fitted = [0, 1, 2]
+    if cut:
+        gone = cut_away(mask, LEFT[view])
+        photo = scene.views[view]
+        masks = {photo.name: photo.valid() & ~gone}
+        scene, resolved, factor = read_scene(workspace, settings, shown, masks)
+        seen, mask = sights(scene), mask & gone
+    else:
+        fitted.remove(view)
+    rest = replace(scene, cloud=coloured(scene, seen, fitted)).reduced(factor)
+    trainer = (rest if cut else rest.without([view])).trainer(resolved, settings.light == "camera")
     trainer.run(None, lambda *_: None)
     for part in trainer.parts:
         part.end(trainer)
-    target = scene.targets[view][factor]
     drawn = trainer.look(trainer.viewpoint(scene.cameras[view].cam_from_world[:3], target))
     image = np.clip(trainer.composited(None, drawn), 0, 1)
-    shown = target.colour.target
-    small = cv2.resize(mask.astype(np.uint8), shown.shape[:0:-1], interpolation=cv2.INTER_NEAREST)
+    photograph = target.colour.target
+    small = cv2.resize(
+        mask.astype(np.uint8), photograph.shape[:0:-1], interpolation=cv2.INTER_NEAREST
+    )
     compared = small > 0
+    if cut:
+        return Prediction(photograph, image.astype(np.float32), compared, None)
     ratios = [
-        (shown[c] / np.maximum(image[c], 0.02))[compared & (shown[c] < BRIGHT)] for c in range(3)
+        (photograph[c] / np.maximum(image[c], 0.02))[compared & (photograph[c] < BRIGHT)]
+        for c in range(3)
     ]
     gains = np.array([np.median(ratio) for ratio in ratios])
     predicted = np.clip(image * gains[:, None, None], 0, 1).astype(np.float32)
-    return Prediction(shown, predicted, compared, gains)
+    return Prediction(photograph, predicted, compared, gains)
+
+
+def cut_away(mask: Bools, left: tuple[float, float]) -> Bools:
+    """[H, W] the columns left and right of the share of a mask [H, W] that is left."""
+    first, last = np.quantile(np.flatnonzero(mask) % mask.shape[1], left)
+    columns = np.arange(mask.shape[1])
+    return np.broadcast_to((columns < first) | (columns > last), mask.shape)
 
 
 def picture(found: Prediction) -> npt.NDArray[np.uint8]:
@@ -178,6 +214,7 @@ def main() -> None:
         default=1,
         help="by order of the views; default 1",
     )
+    parser.add_argument("--cut", action="store_true", help="leave out a part of it")
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--threads", type=int, default=2)
@@ -192,13 +229,13 @@ def main() -> None:
     settings = FitConfig.model_validate({**FIXED, "initial_points": POINTS, **said})
     scores = []
     for workspace in args.workspaces:
-        found = predict(workspace, args.left_out, settings)
+        found = predict(workspace, args.left_out, settings, args.cut)
         scores.append(found.psnr)
-        gains = ", ".join(f"{gain:.2f}" for gain in found.gains)
+        gains = ""
+        if found.gains is not None:
+            gains = ", gains " + ", ".join(f"{gain:.2f}" for gain in found.gains)
         share = found.compared.mean()
-        print(
-            f"{workspace.name}: {found.psnr:.2f} dB on {share:.0%} of it, gains {gains}", flush=True
-        )
+        print(f"{workspace.name}: {found.psnr:.2f} dB on {share:.0%} of it{gains}", flush=True)
         if args.pictures:
             args.pictures.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(args.pictures / f"{workspace.name}.jpg"), picture(found))

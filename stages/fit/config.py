@@ -14,7 +14,7 @@ from stages.fit.parts.colours import Colours
 from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
 from stages.fit.parts.detail import Detail
 from stages.fit.parts.extension import MORE, Extension
-from stages.fit.parts.harmonics import Harmonics
+from stages.fit.parts.harmonics import Harmonics, Photometry
 from stages.fit.parts.light import Light
 from stages.fit.parts.objectives import Depth, Flow, Variation
 from stages.fit.parts.progressive import Progressive
@@ -36,14 +36,14 @@ from stages.fit.settings import (
 
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
-    Progressive, Filling, Shading, Saturation, Coarse, Extension, Harmonics, Detail, Exposure,
-    Background, Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Lining, Poses,
-    Focal, Density, Floaters, Colours,
+    Progressive, Filling, Shading, Saturation, Coarse, Extension, Harmonics, Photometry, Detail,
+    Exposure, Background, Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Lining,
+    Poses, Focal, Density, Floaters, Colours,
 )  # fmt: skip
 PartName = Literal[
     "background", "coarse", "colours", "density", "depth", "detail", "exposure", "extension",
     "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "lining", "mcmc",
-    "poses", "progressive", "saturation", "shading", "surface", "variation", "warp",
+    "photometry", "poses", "progressive", "saturation", "shading", "surface", "variation", "warp",
 ]  # fmt: skip
 
 
@@ -99,10 +99,10 @@ class Basics(PartSettings):
 
 class FitConfig(
     Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings,
-    Density.Settings, Detail.Settings, Harmonics.Settings, Warp.Settings, Surface.Settings,
-    Lining.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings, Poses.Settings,
-    Extension.Settings, Coarse.Settings, Variation.Settings, Depth.Settings, Flow.Settings,
-    Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
+    Density.Settings, Detail.Settings, Photometry.Settings, Harmonics.Settings, Warp.Settings,
+    Surface.Settings, Lining.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings,
+    Poses.Settings, Extension.Settings, Coarse.Settings, Variation.Settings, Depth.Settings,
+    Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 

@@ -7,6 +7,9 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+#: what 3DGS adds to them for a colour
+OFFSET = 0.5
+
 
 def harmonics(directions: npt.NDArray[np.floating]) -> Array:
     """The 16 real spherical harmonics of 3DGS at unit directions [M, 3] -> [M, 16]."""

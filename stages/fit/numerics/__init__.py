@@ -9,11 +9,11 @@ if TYPE_CHECKING:
         colours,
         density,
         detail,
-        emptiness,
         harmonics,
         light,
         moments,
         objectives,
+        photometry,
         surface,
         total_variation,
     )

@@ -5,7 +5,8 @@ seen of it from elsewhere is then what they happened to be. Where a second photo
 exposure or in another light, tells those of its neighbours, the border of what that one shows is an
 edge across a tooth. So the harmonics above the constant are made to change as little as they can
 from one Gaussian to the next, while every photograph's colours stay: a membrane, held where there
-are photographs. The constant is free, as neighbours may have any colour.
+are photographs. The constant is free, as neighbours may have any colour. And where it is known what
+a view is to see, they are changed by no more than that takes.
 """
 
 from __future__ import annotations
@@ -23,6 +24,13 @@ CHUNK = 256
 LEAST = 1e-6
 #: the residual, squared, against what it was: float32 holds no less
 SOLVED = 1e-10
+#: what a change of the constant counts against one of another term: colours change as a whole
+CONSTANT = 0.01
+#: how far views give in that look from nearly the same side but want different colours: those that
+#: nothing is known from, and those that keep what they see
+WISHED, KEPT = 1e-2, 1e-4
+#: Gaussians that are turned in one go
+BLOCK = 16384
 
 
 @kernel(parallel=True)
@@ -105,6 +113,28 @@ def spread(
             before, now = now, _product(rest, better)
             direction = better + F(now / before) * direction
     return np.asarray(start + move, np.float32)
+
+
+def reaching(harmonics: Floats, basis: Array, wanted: Array, sure: Array) -> Floats:
+    """Harmonics [N, K, 3], changed as little as can be, that come to colours in several views.
+
+    Args:
+        harmonics: [N, K, 3] coefficients, the constant first.
+        basis: [V, N, K] what each of them adds to what each view sees.
+        wanted: [V, N, 3] what each view is to see.
+        sure: [V, N] 1 where that must be so, 0 where it is a wish.
+    """
+    found, each = harmonics.copy(), range(len(basis))
+    for first in range(0, len(harmonics), BLOCK):
+        rows = slice(first, first + BLOCK)
+        seen = np.moveaxis(basis[:, rows], 0, 1)  # [B, V, K]
+        missing = np.moveaxis(wanted[:, rows], 0, 1) - seen @ harmonics[rows]
+        cheap = seen.copy()
+        cheap[:, :, 0] /= CONSTANT
+        overlap = cheap @ np.swapaxes(seen, 1, 2)
+        overlap[:, each, each] += KEPT + (WISHED - KEPT) * (1 - sure[:, rows].T)
+        found[rows] += np.swapaxes(cheap, 1, 2) @ np.linalg.solve(overlap, missing)
+    return found
 
 
 def _product(a: Floats, b: Floats) -> float:

@@ -226,7 +226,7 @@ def looks_empty(fit: Trainer, view: int) -> Floats:
     if behind is None or not behind.values.any():
         return np.zeros(photograph.shape[1:], np.float32)
     scale = np.sqrt(photograph[0].size / PIXELS)
-    return numerics.emptiness.looks_like(photograph, fit.without_gaussians(view), scale)
+    return numerics.background.looks_like(photograph, fit.without_gaussians(view), scale)
 
 
 def in_picture(points: AnyArray, viewpoint: Viewpoint) -> tuple[Any, Bools]:
@@ -271,6 +271,6 @@ def worth_keeping(fit: Trainer, positions: Array) -> Bools:
     keep = (most >= s.final_prune_contribution) & (within >= s.final_prune_masked * everywhere)
     unseen = np.flatnonzero(empty > s.final_prune_empty * within)
     measured = fit.scene.cloud.positions[fit.scene.trusted]
-    keep[unseen] &= numerics.emptiness.near_measured(fit.packed[unseen, :3], measured)
+    keep[unseen] &= numerics.background.near_measured(fit.packed[unseen, :3], measured)
     keep &= fit.packed[:, 10] > logit(s.prune_opacity)
     return np.asarray(keep & ~before_lens(fit.packed, viewpoints, nearest))
