@@ -4,12 +4,11 @@
                                            [--cut] [--pictures DIR] [--threads 2]
 
 Each workspace is of three photographs, run up to `sap`: right, frontal, left. Cameras and surface
-are those of all three;
-colours are fitted to two of them, at about half size. Compared is what the third shows of surface
-that another one sees well, with a gain for each channel, as exposures differ. Real patients have no
-other truth: this is the one figure of unseen views that they give. What is a hole in the render
-counts as black: surface is known to be there. --set says a setting of the fit anew: `--set
-headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
+are those of all three; colours are fitted to two of them, at about half size. Compared is what the
+third shows of surface that another one sees well, with a gain for each channel, as exposures
+differ. Real patients have no other truth: this is the one figure of unseen views that they give.
+What is a hole in the render counts as black: surface is known to be there. --set says a setting of
+the fit anew: `--set headlight=0.6 --set headlight_shoulder=0`, `--set light=camera`.
 
 With --cut only a part of it is left out, 40 % of what another one shows as well (of the frontal
 photograph on both sides, of the others towards the front teeth), and no gains are allowed: what
@@ -57,7 +56,7 @@ class Prediction:
     """Attributes:
     shown: [3, H, W] the photograph that was left out; predicted: the same, with the gains.
     compared: [H, W] where.
-    gains: [3] of the channels, or None.
+    gains: [3] of the channels; None where none are allowed.
     """
 
     shown: Floats

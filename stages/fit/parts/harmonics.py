@@ -69,7 +69,11 @@ def _turn(fit: Trainer, harmonics: Floats) -> None:
 
 
 class Harmonics(Part, switch="harmonics_at", on=0.3, off=0.0):
-    """Once, while Gaussians are few; the steps after it bring back what photographs lost by it."""
+    """How colours turn with the view, where no photograph tells it: as beside it.
+
+    Once, while Gaussians are few; the steps after it bring back what photographs lost by it. It
+    helps views from elsewhere, not the borders of photographs: those are for `Photometry`.
+    """
 
     class Settings(PartSettings):
         harmonics_at: AutoFloat = automatic({3: 0.0}, held=0.3, le=1)
