@@ -21,7 +21,7 @@ def teeth() -> None:
     import stages.init.dental.cameras.minimise  # noqa: F401
     from stages.init.dental.surface.chart.raster import raster_chart
     from stages.init.dental.surface.dense import ArchSurface
-    from stages.init.dental.surface.photo import Photo
+    from stages.init.dental.surface.photos.photo import Photo
     from stages.init.dental.surface.sweep import matching_cost
     from stages.init.dental.turned_sheet import render_turned
 
@@ -31,7 +31,7 @@ def teeth() -> None:
     photos = [
         Photo(
             k, camera, (HEIGHT, WIDTH), 1.0, image, plain, plain, plain, plain, plain, plain,
-            plain, plain, used,
+            plain, plain, plain, used,
         )
         for k in range(VIEWS)
     ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.surface.chart.grid import AXIS_DEPTH
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 
 
 def photo(yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0) -> Photo:
@@ -24,7 +24,7 @@ def photo(yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0) ->
         image=np.zeros((*size, 3), np.float32),
         texture=rng.normal(size=size).astype(np.float32),
         upper=plain, lower=plain, upper_gum=plain, lower_gum=plain, dull=plain + 1,
-        void=plain, covered=plain,
+        void=plain, covered=plain, hardware=plain,
         valid=np.ones(size, bool),
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart.grid import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.grow import best_bend
-from stages.init.dental.surface.photo import find_void
+from stages.init.dental.surface.photos.tissue import find_void
 from tests.stages.dental_surface_case import photo
 
 OFFSETS = (np.arange(-20, 21) * 0.25).astype(np.float32)

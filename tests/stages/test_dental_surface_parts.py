@@ -29,7 +29,7 @@ from stages.init.dental.surface.colour import (
 )
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import find_gum
+from stages.init.dental.surface.photos.tissue import find_gum
 from stages.init.dental.surface.sweep import choose_pairs, matching_cost
 from tests.stages.dental_surface_case import photo, row_of_teeth
 

@@ -21,7 +21,7 @@ from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import FullSize
+from stages.init.dental.surface.photos.photo import FullSize
 from stages.init.dental.turned_sheet import turned_sheet
 
 Array = npt.NDArray[np.float64]

@@ -12,7 +12,7 @@ from numba import prange
 
 from pipeline.kernels import kernel
 from stages.init.dental.surface.fit import fit_offsets, reweighted
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -31,7 +31,7 @@ from stages.init.dental.surface.colour import (
     spread_colour,
 )
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

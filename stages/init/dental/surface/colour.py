@@ -10,7 +10,8 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline.artifacts.dental.fdi import Jaw
-from stages.init.dental.surface.photo import Photo, disc
+from stages.init.dental.surface.photos.photo import Photo
+from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]

@@ -28,7 +28,8 @@ from stages.init.dental.surface.chart.jaws import (
 )
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo, disc, joined_to
+from stages.init.dental.surface.photos.photo import Photo
+from stages.init.dental.surface.photos.tissue import disc, joined_to
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

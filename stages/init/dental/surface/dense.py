@@ -19,6 +19,11 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.kernels import kernel_threads
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
+from stages.init.dental.surface.chart.hardware import (
+    free_of_hardware,
+    raise_hardware,
+    shows_hardware,
+)
 from stages.init.dental.surface.chart.jaws import (
     PAST_EDGE,
     Chart,
@@ -36,7 +41,7 @@ from stages.init.dental.surface.ends import within_rows
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.measured import bend_to
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
-from stages.init.dental.surface.photo import FullSize, Photo, at_full_size, prepare_photo
+from stages.init.dental.surface.photos.photo import FullSize, Photo, at_full_size, prepare_photo
 from stages.init.dental.surface.sweep import choose_pairs, sweep
 
 Array32 = npt.NDArray[np.float32]
@@ -124,10 +129,11 @@ def dense_surface(
         near = replace(options, gum_height=min(options.gum_height, options.grow_from))
         for number, settings in enumerate(options.rounds if pairs else ()):
             progress("sweep", 2 + number, steps)
-            _sweep(charts, photos, pairs, settings, near, threads)
+            _sweep(charts, photos, pairs, settings, near, threads, first=number == 0)
         if pairs and options.rounds and options.gum_height > options.grow_from:
             grow_gum(charts, photos, pairs, options, threads)
             _sweep(charts, photos, pairs, options.rounds[-1], options, threads)
+        _raise(charts, photos, pairs, options, threads)
         progress("colour", steps - 1, steps)
         looked = _look_at(charts, photos, full, options, threads)
         cloud = coloured_cloud(
@@ -268,17 +274,37 @@ def _sweep(
     settings: SweepRound,
     options: SurfaceOptions,
     threads: int,
+    first: bool = False,
 ) -> None:
-    """One round over all charts, in place."""
+    """One round over all charts, in place; the first one looks for brackets as well."""
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
     seen = [comparable(chart, photos, nearest, options) for chart in charts]
     for chart, shown in zip(charts, seen, strict=True):
         trust = chart.gum_fades(options.gum_trust)
+        if first:
+            chart.hardware = shows_hardware(chart, photos, shown, pairs)
+        if chart.hardware:
+            trust = trust * free_of_hardware(chart, photos, shown)
         found = sweep(
             chart.grid, chart.radius, photos, shown, pairs, trust,
             chart.used(PAST_EDGE, options.gum_height), settings, options,
         )  # fmt: skip
         chart.radius, chart.agreement = found.radius, found.weight
+
+
+def _raise(
+    charts: list[Chart],
+    photos: list[Photo],
+    pairs: list[list[int]],
+    options: SurfaceOptions,
+    threads: int,
+) -> None:
+    """Brackets and wires stand out before the crowns of the charts that have some, in place."""
+    if any(chart.hardware for chart in charts):
+        nearest = nearest_depths(charts, photos, options.gum_height, threads)
+        for chart in charts:
+            if chart.hardware:
+                raise_hardware(chart, photos, comparable(chart, photos, nearest, options), pairs)
 
 
 def _anchor(photos: list[Photo], fit: ArchFit) -> int:

@@ -17,7 +17,8 @@ from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.chart.jaws import HIDDEN, PAST_EDGE, Chart
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo, disc
+from stages.init.dental.surface.photos.photo import Photo
+from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

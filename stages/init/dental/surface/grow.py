@@ -18,7 +18,7 @@ from stages.init.dental.surface.chart.crown_shape import beyond_crowns
 from stages.init.dental.surface.chart.grid import ChartGrid
 from stages.init.dental.surface.chart.jaws import PAST_EDGE, Chart, comparable, nearest_depths
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 from stages.init.dental.surface.sweep import match, sweep
 
 Array32 = npt.NDArray[np.float32]

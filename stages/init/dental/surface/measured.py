@@ -16,7 +16,7 @@ from stages.init.dental.surface.chart.grid import MEAN_RADIUS, ChartGrid, unroll
 from stages.init.dental.surface.chart.jaws import PAST_EDGE, Chart
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 

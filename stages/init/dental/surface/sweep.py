@@ -20,7 +20,7 @@ from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart.grid import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 
 Array32 = npt.NDArray[np.float32]

@@ -22,7 +22,8 @@ from stages.init.dental.surface.chart.crown_shape import (
 from stages.init.dental.surface.chart.grid import ChartGrid, grid_around, normals_of
 from stages.init.dental.surface.chart.raster import nearest_of, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photo import Photo, disc
+from stages.init.dental.surface.photos.photo import Photo
+from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -55,12 +56,14 @@ class Chart:
         grid: where its samples lie.
         radius: [H, W] float32 distance from the axis, mm.
         agreement: [H, W] float32 0..1: how well the photographs agree there.
+        hardware: whether brackets and wires are fixed to its crowns.
     """
 
     shape: JawShape
     grid: ChartGrid
     radius: Array32
     agreement: Array32
+    hardware: bool = False
 
     @property
     def points(self) -> Array32:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.kernels import helper, kernel
-from stages.init.dental.surface.photo import Photo
+from stages.init.dental.surface.photos.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import PlacedView
+from stages.init.dental.surface.photos.tissue import find_gum, find_hardware, find_void
 from stages.stereo.appearance import highlights
 
 Array32 = npt.NDArray[np.float32]
@@ -24,28 +25,6 @@ _LIGHT, _RED = 0.6, -0.8
 _NORMALISE = 1.2
 #: Contrast below this (8-bit Lab units) is noise.
 _NOISE = 4.0
-#: Gum is learnt in a ring beside the crowns (mm) on the gums' side.
-_RING = (0.4, 2.2)
-#: Least standard deviations of the gum's colour (8-bit L, a, b).
-_GUM_SPREAD = (14.0, 4.0, 4.5)
-#: Lighter and less red than the gum by more than so many standard deviations: not gum.
-_PALE = 1.8
-#: Holes in tooth and gum up to this size (square mm) that are not dark are wet highlights, or
-#: crowns of another colour.
-_BRIGHT_HOLE = 30.0
-#: Highlights that tissue encloses may be so large (square mm; the largest of 48 photographs: 73).
-#: Most of one is lighter than the gum by more than shade makes it darker, and of what is not white
-#: at least so much is red: retractors are grey, lips and cheeks that look like a hole are darker.
-_HIGHLIGHT, _RED_SHARE = 80.0, 0.85
-#: Not dark: lighter than so much of the gum.
-_LIT = 0.6
-#: Share of that size up to which a hole is a speck, bright or not.
-_SPECK = 0.02
-#: Darker than so much of the median of the teeth, over at least so many mm: nothing is there that a
-#: light beside the lens could reach.
-_VOID, _VOID_SIZE = 0.2, 1.0
-#: Gum in shade: that much darker (8-bit L) is no reason to call it something else.
-_GUM_SHADE = 25.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +44,7 @@ class Photo:
         dull: [H, W] float32: 1, and 0 in highlights.
         void: [H, W] float32 0 or 1: so dark that nothing can be there, near or far.
         covered: [H, W] float32 0 or 1: something stands before the teeth and the gum.
+        hardware: [H, W] float32 0..1: how sure it is metal that is fixed to the crowns.
         valid: [H, W] bool.
     """
 
@@ -81,6 +61,7 @@ class Photo:
     dull: Array32
     void: Array32
     covered: Array32
+    hardware: Array32
     valid: Mask
 
     def tooth_of(self, jaw: Jaw) -> Array32:
@@ -163,6 +144,7 @@ def at_full_size(photo: Photo, full: FullSize) -> Photo:
         dull=enlarged(photo.dull),
         void=((enlarged(photo.void) > 0.5) & full.valid).astype(np.float32),
         covered=((enlarged(photo.covered) > 0.5) & ~tooth).astype(np.float32),
+        hardware=enlarged(photo.hardware),
         valid=full.valid,
     )
 
@@ -225,6 +207,7 @@ def prepare_photo(
         dull=(1 - shiny).astype(np.float32),
         void=(void & valid).astype(np.float32),
         covered=np.zeros((height, width), np.float32),
+        hardware=find_hardware(lab, tooth, density),
         valid=valid,
     )
 
@@ -242,128 +225,3 @@ def _texture(lab: Array32, density: float) -> Array32:
     spread = np.sqrt(cv2.GaussianBlur((plain - mean) ** 2, (0, 0), sigma)) + np.float32(_NOISE)
     normal = np.clip((plain - mean) / spread, -3, 3).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(normal, (0, 0), max(0.07 * density, 0.4)), np.float32)
-
-
-def find_gum(
-    lab: Array32,
-    tooth: Mask,
-    shiny: Mask,
-    dentition: Dentition,
-    density: float,
-    deviations: float,
-) -> Mask:
-    """Gum around the teeth, told from gloves, lips, retractors and the dark by its colour.
-
-    The ring just beyond the crowns is gum nearly everywhere: its median colour and spread are those
-    of this patient's gum in this light.
-
-    Args:
-        lab: [H, W, 3] float32, 8-bit scaling.
-        tooth: [H, W] bool.
-        shiny: [H, W] bool, highlights.
-        dentition: the teeth.
-        density: pixels per mm.
-        deviations: furthest colour, in standard deviations.
-
-    Returns:
-        [H, W] bool; all False where nothing red is beside the crowns.
-    """
-    distance = cv2.distanceTransform((~tooth).astype(np.uint8), cv2.DIST_L2, 5) / density
-    ring = (distance > _RING[0]) & (distance < _RING[1]) & _gumwards(tooth, dentition)
-    red = lab[..., 1] > (np.median(lab[tooth, 1]) if tooth.any() else 0) + 6
-    seed = lab[ring & red]
-    if len(seed) < 50:
-        return np.zeros(tooth.shape, bool)
-    middle = np.median(seed, axis=0)
-    spread = np.maximum(1.4826 * np.median(np.abs(seed - middle), axis=0), _GUM_SPREAD)
-    smooth = np.asarray(cv2.GaussianBlur(lab, (0, 0), max(0.1 * density, 0.6)), np.float32)
-    away = (smooth - middle.astype(np.float32)) / spread.astype(np.float32)
-    away[..., 0] = np.where(
-        away[..., 0] < 0, np.minimum(away[..., 0] + _GUM_SHADE / spread[0], 0), away[..., 0]
-    )
-    # Gloves and lips under them are both lighter and less red than gum.
-    pale = (away[..., 0] - away[..., 1]) / np.float32(np.sqrt(2))
-    like = ((away**2).sum(-1) < deviations**2) & (pale < _PALE) & ~tooth
-    small = disc(0.35 * density)
-    # Small wet highlights on the gum are gum; thin red seams of a glove are not.
-    closed = cv2.morphologyEx((like | tooth).astype(np.uint8), cv2.MORPH_CLOSE, small)
-    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, small) > 0
-    tissue = opened | tooth
-    lit, light = (smooth[..., 0] > level for level in (_LIT * middle[0], middle[0] + _GUM_SHADE))
-    tissue = tissue | _bright_holes(tissue, lit, _BRIGHT_HOLE * density**2)
-    tissue = tissue | _highlights_within(tissue, light, red, shiny, _HIGHLIGHT * density**2)
-    return joined_to(tissue, tooth) & ~tooth
-
-
-def disc(radius: float) -> npt.NDArray[np.uint8]:
-    """A disc of so many whole pixels, at least one, to erode and dilate with."""
-    size = max(int(radius), 1)
-    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
-    return np.asarray(shape, np.uint8)
-
-
-def joined_to(mask: Mask, seeds: Mask) -> Mask:
-    """[H, W] bool: the pieces of a mask [H, W] that hold one of the seeds [H, W]."""
-    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    held = np.zeros(count, bool)
-    held[np.unique(label[seeds])] = True
-    held[0] = False
-    return held[label]
-
-
-def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:
-    """Where a photograph shows nothing but the dark around the jaws.
-
-    Args:
-        lightness: [H, W] float32, CIE L as in 8-bit images.
-        tooth: [H, W] bool.
-        density: pixels per mm.
-
-    Returns:
-        [H, W] bool; all False where no tooth is there to compare with.
-    """
-    if not tooth.any():
-        return np.zeros(tooth.shape, bool)
-    smooth = np.asarray(cv2.GaussianBlur(lightness, (0, 0), max(0.1 * density, 0.6)))
-    dark = (smooth < _VOID * np.median(smooth[tooth])) & ~tooth
-    narrow = disc(round(_VOID_SIZE / 2 * density))
-    return np.asarray(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, narrow) > 0)
-
-
-def _bright_holes(tissue: Mask, bright: Mask, most: float) -> Mask:
-    """Holes of at most `most` pixels, most of which are bright."""
-    count, label = cv2.connectedComponents((~tissue).astype(np.uint8), connectivity=4)
-    area = np.bincount(label.ravel(), minlength=count)
-    lit = np.bincount(label[bright], minlength=count)
-    hole = ((area <= most) & (lit > 0.7 * area)) | (area <= most * _SPECK)
-    hole[0] = False
-    return hole[label]
-
-
-def _highlights_within(tissue: Mask, light: Mask, red: Mask, shiny: Mask, most: float) -> Mask:
-    """Holes of at most `most` pixels that tissue encloses, lighter than it and as red."""
-    count, label = cv2.connectedComponents((~tissue).astype(np.uint8), connectivity=4)
-
-    def pixels(mask: Mask) -> npt.NDArray[np.int64]:
-        return np.bincount(label[mask], minlength=count)
-
-    area = pixels(~tissue)
-    hole = (area <= most) & (pixels(light) > area / 2)
-    hole &= pixels(red & ~shiny) >= _RED_SHARE * pixels(~shiny)
-    hole[np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])] = False
-    hole[0] = False
-    return hole[label]
-
-
-def _gumwards(tooth: Mask, dentition: Dentition) -> Mask:
-    """[H, W] bool: beyond the row of teeth, not between the jaws."""
-    y, x = np.mgrid[: tooth.shape[0], : tooth.shape[1]]
-    places, across = dentition.levelled(x, y)
-    along = np.rint(places).astype(np.int64)
-    along -= along.min()
-    size = int(along.max()) + 1
-    highest = np.full(size, np.inf)
-    lowest = np.full(size, -np.inf)
-    np.minimum.at(highest, along[tooth], across[tooth])
-    np.maximum.at(lowest, along[tooth], across[tooth])
-    return (across < highest[along]) | (across > lowest[along])

@@ -1,0 +1,1 @@
+"""What the photographs show of teeth, gum and what is fixed to them."""
