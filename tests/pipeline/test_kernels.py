@@ -195,7 +195,7 @@ class TestRehearsals:
 
     @pytest.mark.parametrize("stage", ["init", "align", "flow", "fit", "export", "evaluate"])
     def test_every_one_can_be_held(self, stage):
-        """One that fails in its process is not heard of: kernels are compiled later, that is all."""
+        """One that fails in its process is not heard of: kernels are compiled later."""
         for name in get_stage(stage).rehearsals:
             module, _, function = name.partition(":")
             getattr(importlib.import_module(module), function)()
