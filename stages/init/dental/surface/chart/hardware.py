@@ -18,7 +18,6 @@ from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 #: Square mm that two photographs show on a jaw with braces: about four brackets. Real patients: 149
 #: with braces, 0 to 23 on 25 jaws without (stains, fillings, shade between crowns); generated ones:
@@ -36,11 +35,13 @@ _STEP_COST = 0.25
 #: back to its front they nearly are, as photographs from the side show its flanks too. Of these
 #: the highest is taken, being better by so much per mm. .8 and .88 serve real views alike.
 _AS_GOOD, _HIGHER = 0.8, 0.02
-#: Share of it that has to lie on itself at the best heights: .56 to .72 with braces; .3 at most, of
-#: what little there is, without.
+#: Share of it that has to lie on itself at the heights taken: .50 to .64 with braces; without, .3
+#: at most of what little there is, even at the heights where most does.
 _LEAST_OVERLAP = 0.4
 #: A sample is raised where two photographs are so sure of it.
 _SURE = 0.5
+#: Gaps in it up to this wide to either side (mm) are raised with it: what shines.
+_GAP = 0.5
 #: The raised part's rim is smoothed over this length (mm).
 _RIM = 0.2
 
@@ -75,9 +76,10 @@ def raise_hardware(
     seen: npt.NDArray[np.bool_],
     pairs: list[list[int]],
 ) -> None:
-    """Raise what is fixed to the crowns to where it stands, in place; arguments as above.
+    """Raise what is fixed to the crowns to where it stands, in place.
 
-    What one photograph alone shows of it stays where it is: nothing tells how high it stands.
+    Arguments as for `shows_hardware`, with the crowns in place. What one photograph alone shows of
+    it stays where it is: nothing tells how high it stands.
     """
     rows, columns = chart.grid.shape
     both = np.zeros((len(_HEIGHTS), rows, columns), np.float32)
@@ -95,7 +97,9 @@ def raise_hardware(
         return
     below = np.clip(np.searchsorted(_HEIGHTS, height, "right") - 1, 0, len(_HEIGHTS) - 1)
     sure = both[below, :, np.arange(columns)].T > _SURE
-    whole = cv2.morphologyEx(sure.astype(np.uint8), cv2.MORPH_CLOSE, disc(0.5 * chart.grid.density))
+    whole = cv2.morphologyEx(
+        sure.astype(np.uint8), cv2.MORPH_CLOSE, disc(_GAP * chart.grid.density)
+    )
     raised = (whole * height[None]).astype(np.float32)
     chart.radius = chart.radius + cv2.GaussianBlur(raised, (0, 0), _RIM * chart.grid.density)
 
