@@ -33,7 +33,7 @@ class ChoiceOptions:
     least_extent: float = 0.3
     least_colour: float = 4.0
     same_view: float = 0.02
-    least_score: float = 0.85
+    least_score: float = 0.9
     apart_gap: float = 0.3
 
 
@@ -69,7 +69,7 @@ def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
         return "it has no colour: an X-ray, or not a photograph"
     if len(dentition.all_crowns) < options.least_crowns:
         return f"no row of teeth was found in it ({len(dentition.all_crowns)} crowns)"
-    if float(np.median([c.score for c in dentition.all_crowns])) < options.least_score:
+    if usual_score(dentition) < options.least_score:
         return "what was found in it hardly looks like teeth"
     if row_extent(dentition) < options.least_extent:
         return "the teeth are too small in it: a face, or taken from too far away"
@@ -83,6 +83,19 @@ def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
     if reading.apart > 0.5 or dentition.jaws_apart > options.apart_gap:
         return "the jaws are apart in it"
     return ""
+
+
+def usual_score(dentition: Dentition) -> float:
+    """Median score of a photograph's crowns, each counting by its area.
+
+    Crowns of a few pixels, such as those at the sides of a frontal photograph, score low, more so
+    with brackets on them; of a house the large ones score low as well.
+    """
+    scores = np.array([crown.score for crown in dentition.all_crowns])
+    areas = [cv2.contourArea(crown.outline.astype(np.float32)) for crown in dentition.all_crowns]
+    order = np.argsort(scores)
+    below = np.cumsum(np.array(areas)[order])
+    return float(scores[order][np.searchsorted(below, below[-1] / 2)])
 
 
 def chroma(image: Array32) -> float:

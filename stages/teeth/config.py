@@ -37,9 +37,10 @@ class TeethConfig(StageConfig):
         description="mean chroma (CIE ab) below which a photograph is an X-ray or not in colour",
     )  # fmt: skip
     least_score: float = Field(
-        0.85, ge=0, le=1,
-        description="with a lower median score of its crowns a photograph shows something else "
-        "(photographs of teeth: .94 and more; of houses: .8 at most)",
+        0.9, ge=0, le=1,
+        description="with a lower median score of its crowns, each counting by its area, a "
+        "photograph shows something else (clinics' photographs of teeth, braces too: .95 and "
+        "more; of houses: .88 at most)",
     )  # fmt: skip
     same_view: float = Field(
         0.02, ge=0, le=1,

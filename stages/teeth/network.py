@@ -28,6 +28,8 @@ KINDS = ("front", "right", "left", "upper", "lower", "other")
 _MEAN, _SPREAD = 0.45, 0.25
 #: Channels of the answer.
 _TOOTH, _INSIDE, _CENTRE, _BORDER = 0, 1, slice(2, 4), 4
+#: Unit of the way to a crown's centre, pixels of the answer.
+_CENTRE_UNIT = np.float32(16)
 _JAW, _SIDE, _PRIMARY, _POSITION = 5, 6, 7, slice(8, 16)
 
 
@@ -38,6 +40,7 @@ class Answer:
     Attributes:
         tooth: [h, w] logit of being tooth.
         inside: [h, w] 0..1, distance to the crown's own border over that of its middle.
+        centre: [2, h, w] x and y from each pixel to the middle of its crown, in pixels of the maps.
         border: [h, w] 0..1: two crowns touch here.
         lower, left, primary: [h, w] logits: of the lower jaw, the patient's left, a primary tooth.
         position: [8, h, w] log probability of the place in the quadrant, from the midline.
@@ -48,6 +51,7 @@ class Answer:
 
     tooth: Array
     inside: Array
+    centre: Array
     border: Array
     lower: Array
     left: Array
@@ -101,6 +105,7 @@ def look(image: Array, valid: npt.NDArray[np.bool_], transform: Transform, flip:
         other, other_kind = _forward(np.ascontiguousarray(picture[..., ::-1]))
         other = other[..., ::-1].copy()
         other[_SIDE] *= -1
+        other[_CENTRE][0] *= -1
         half = np.float32(0.5)
         maps = half * (maps + other)
         kind = half * (kind + other_kind[[0, 2, 1, 3, 4, 5, 6]])
@@ -109,6 +114,7 @@ def look(image: Array, valid: npt.NDArray[np.bool_], transform: Transform, flip:
     return Answer(
         tooth=tooth,
         inside=_sigmoid(maps[_INSIDE]),
+        centre=maps[_CENTRE] * _CENTRE_UNIT,
         border=_sigmoid(maps[_BORDER]),
         lower=maps[_JAW],
         left=maps[_SIDE],

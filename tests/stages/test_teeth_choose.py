@@ -90,6 +90,13 @@ def test_pictures_without_colour_teeth_or_size_are_set_aside() -> None:
     windows = tuple(replace(crown, score=0.7) for crown in good.dentition.upper)
     house = reading(replace(good.dentition, upper=windows, lower=windows))
     assert "hardly looks like teeth" in reasons(house)[0]
+    tiny = [
+        replace(crown, score=0.7, outline=crown.centre + 0.3 * (crown.outline - crown.centre))
+        for crown in good.dentition.upper
+    ]
+    both = {jaw: (*getattr(good.dentition, jaw), *tiny) for jaw in ("upper", "lower")}
+    braces = reading(replace(good.dentition, **both))
+    assert reasons(braces) == [""], "many small crowns that are hardly sure say nothing"
     small = reading(replace(good.dentition, size=(1800, 1200)))
     assert "too small" in reasons(small)[0]
 

@@ -14,9 +14,12 @@ LEFT, MIDDLE, RIGHT = 20, 40, 60
 
 def answer(
     places: tuple[int, int], sure: float = 0.95, lower: tuple[float, float] = (-6.0, -6.0),
-    tooth: float = 6.0,
+    tooth: float = 6.0, to_one: float = 0.0,
 ) -> Answer:  # fmt: skip
-    """Two crowns side by side, the second one with a place and a logit of tooth of its own."""
+    """Two crowns side by side, the second one with a place and a logit of tooth of its own.
+
+    They point to their own middles, and by a share `to_one` to the one between them.
+    """
     rows, columns = np.indices(SIZE).astype(np.float32)
     second = columns >= MIDDLE
     within = (np.abs(rows - 20) < 12) & (columns >= LEFT) & (columns < RIGHT)
@@ -29,6 +32,7 @@ def answer(
     maps = {
         "tooth": np.where(within, logit, -6),
         "inside": inside,
+        "centre": [(1 - to_one) * middle + to_one * MIDDLE - columns, 20 - rows],
         "border": np.clip(1 - np.abs(columns - MIDDLE) / 2, 0, 1) * within,
         "lower": np.where(second, *lower[::-1]),
         "left": np.full(SIZE, -6.0),
@@ -48,9 +52,16 @@ def test_parts_of_one_molar_are_one_crown() -> None:
     assert np.exp(crown.position[5]) == pytest.approx(0.95, abs=0.01)
 
 
+def test_parts_of_any_tooth_are_one_crown_if_they_point_to_one_middle() -> None:
+    (crown,) = find_crowns(answer((1, 1), to_one=0.8))
+    assert np.ptp(crown.polygon[:, 0]) == pytest.approx(RIGHT - LEFT, abs=2)
+
+
 @pytest.mark.parametrize(
     ("places", "more"),
     [
+        pytest.param((1, 1), {"to_one": 0.2}, id="a middle each"),
+        pytest.param((1, 2), {"to_one": 0.8}, id="neighbours that point to one middle"),
         pytest.param((5, 6), {}, id="neighbours"),
         pytest.param((4, 4), {}, id="premolars"),
         pytest.param((5, 5), {"sure": 0.8}, id="not sure enough"),
