@@ -186,13 +186,14 @@ def match(
     a: Sequence[Prepared], b: Sequence[Prepared], state: State,
     between: Callable[..., list[Spots]] = spots_between,
 ) -> list[Spots]:  # fmt: skip
-    """The spots of all pairs of photographs."""
+    """The spots of all pairs of photographs, of teeth that are known in 3D."""
 
     def of(pair: tuple[int, int]) -> list[Spots]:
         i, j = pair
         return between(a[i], b[j], state.cameras[j], state.motions, i, j)
 
-    found = list(chain(*in_threads(of, compared_pairs(a, state), usable_cores())))
+    every = chain(*in_threads(of, compared_pairs(a, state), usable_cores()))
+    found = [spots for spots in every if spots.tooth in state.motions]
     total: dict[int, int] = {}
     for spots in found:
         total[spots.tooth] = total.get(spots.tooth, 0) + len(spots.points)

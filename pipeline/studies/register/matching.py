@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.studies.register.hardware import painted_over
 from pipeline.studies.register.visit import Floats, Labels, Look
 
 Array = npt.NDArray[np.float64]
@@ -109,10 +110,10 @@ def prepare(look: Look) -> Prepared:
     from stages.flow.estimate import local_contrast
 
     scale = max(look.image.shape) / 512
-    dull, shiny = without_shine(look.image, scale)
+    dull, shiny = without_shine(painted_over(look), scale)
     gray = np.clip(np.rint(dull * 255), 0, 255).astype(np.uint8)
     contrast = local_contrast(gray, CONTRAST * scale)
-    labels = look.labels
+    labels = look.enamel
     distance, nearest = cv2.distanceTransformWithLabels(
         (labels == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -197,7 +198,7 @@ def spots_between(
     visible = common & ~hidden(pixels, z, inside, camera)
     column, row = (np.clip(found[..., k].round().astype(int), 0, size - 1)
                    for k, size in ((0, camera.width), (1, camera.height)))  # fmt: skip
-    there = b.look.labels[row, column]
+    there = b.look.enamel[row, column]
     visible &= b.look.valid[row, column]
     result = []
     for number in (int(n) for n in np.unique(a.core[visible]) if n):

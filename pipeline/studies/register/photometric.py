@@ -110,10 +110,10 @@ def facings(
         inside = (
             (z > 1) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         )
-        names = other.look.labels[row[inside], column[inside]]
+        names = other.look.enamel[row[inside], column[inside]]
         if (names > 0).sum() < LEAST:
             continue
-        theirs = (other.look.labels == np.bincount(names[names > 0]).argmax()).astype(np.float32)
+        theirs = (other.look.enamel == np.bincount(names[names > 0]).argmax()).astype(np.float32)
         near = cv2.dilate(theirs, np.ones((5, 5), np.uint8)) > 0
         kept = np.flatnonzero(inside)[near[row[inside], column[inside]]]
         if len(kept) < max(LEAST, 0.3 * len(points)):

@@ -39,6 +39,7 @@ class Look:
         labels: [H, W] uint8 FDI number of the crown at each pixel, 0: none.
         depth: [H, W] float32 z of the scene, mm; 0 where it is not known.
         valid: [H, W] bool, where the photograph may be used.
+        hardware: [H, W] bool, brackets and wires; None: there are no braces.
     """
 
     camera: Camera
@@ -46,6 +47,14 @@ class Look:
     labels: Labels
     depth: Floats
     valid: npt.NDArray[np.bool_]
+    hardware: npt.NDArray[np.bool_] | None = None
+
+    @property
+    def enamel(self) -> Labels:
+        """[H, W] `labels`, 0 on hardware."""
+        if self.hardware is None:
+            return self.labels
+        return np.where(self.hardware, 0, self.labels).astype(np.uint8)
 
     @cached_property
     def points(self) -> Array:
@@ -60,11 +69,12 @@ class Visit:
     Attributes:
         name: for messages.
         looks: photographs with cameras and teeth, in the order of the run.
-        teeth: FDI number -> [N, 3] points of its crown, mm.
+        teeth: FDI number -> [N, 3] points of its crown's enamel, mm.
         scale_percent: relative standard deviation of its millimetres, percent.
         scale_source: where millimetres come from, in words.
         gaussians: the scene, in the run's own world; None in tests.
         frame: [4, 4] similarity from that world to this frame.
+        covered: FDI number -> [3] middle of a crown with the hardware on it; none without braces.
     """
 
     name: str
@@ -74,6 +84,7 @@ class Visit:
     scale_source: str = ""
     gaussians: Gaussians | None = None
     frame: Array = field(default_factory=lambda: np.eye(4))
+    covered: Mapping[int, Array] = field(default_factory=dict)
 
     def in_frame(self, frame: Array) -> Visit:
         """The visit in a frame that a similarity [4, 4] leads to."""
@@ -88,12 +99,14 @@ class Visit:
             ),
             teeth={n: p @ frame[:3, :3].T + frame[:3, 3] for n, p in self.teeth.items()},
             frame=frame @ self.frame,
+            covered={n: frame[:3, :3] @ p + frame[:3, 3] for n, p in self.covered.items()},
         )  # fmt: skip
 
     @cached_property
     def centres(self) -> dict[int, Array]:
         """FDI number -> [3] middle of what is seen of the crown, mm."""
-        return {number: np.median(points, axis=0) for number, points in self.teeth.items()}
+        middles = {number: np.median(points, axis=0) for number, points in self.teeth.items()}
+        return middles | dict(self.covered)
 
 
 def read_visit(workspace: Path) -> Visit:
@@ -102,6 +115,7 @@ def read_visit(workspace: Path) -> Visit:
     Raises:
         RequestError: no run, an unfinished one, or one without teeth.
     """
+    from pipeline.studies.register.hardware import told_hardware
     from pipeline.studies.report.reading import read_case
     from stages.splatting.rendering import render
 
@@ -122,7 +136,7 @@ def read_visit(workspace: Path) -> Visit:
             )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()
-    looks = []
+    looks, pictures = [], []
     for camera in cameras.cameras:
         dentition = read.get(camera.name)
         view = by_name.get(camera.name)
@@ -130,6 +144,7 @@ def read_visit(workspace: Path) -> Visit:
             continue
         rendered = render(gaussians, camera)
         known = (rendered.alpha >= LEAST_ALPHA) & (rendered.depth > 0)
+        pictures.append(view.image)
         looks.append(
             Look(
                 camera, cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), labels_of(dentition, view),
@@ -149,6 +164,9 @@ def read_visit(workspace: Path) -> Visit:
         percent, source = 100 * TEXTBOOK_DEVIATION, SOURCES["textbook_teeth"]
     made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians)
     made = made.in_frame(frame)
+    told = tuple(told_hardware(made.looks, pictures))
+    if any(look.hardware is not None for look in told):
+        made = replace(made, looks=told, teeth=teeth_points(told), covered=made.centres)
     return replace(made, scale_percent=float(percent or 0.0), scale_source=source)
 
 
@@ -211,8 +229,9 @@ def teeth_points(looks: list[Look] | tuple[Look, ...]) -> dict[int, Array]:
     """FDI number -> [N, 3] points inside its outlines of all photographs, without stray ones."""
     found: dict[int, list[Array]] = {}
     for look in looks:
-        for number in (int(n) for n in np.unique(look.labels) if n):
-            inner = cv2.erode((look.labels == number).astype(np.uint8), np.ones((3, 3), np.uint8))
+        enamel = look.enamel
+        for number in (int(n) for n in np.unique(enamel) if n):
+            inner = cv2.erode((enamel == number).astype(np.uint8), np.ones((3, 3), np.uint8))
             inside = (inner > 0) & (look.depth > 0)
             if inside.sum() >= LEAST_PIXELS:
                 found.setdefault(number, []).append(look.points[inside])

@@ -1,0 +1,90 @@
+"""Brackets put on between two visits say nothing of what the teeth did."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.errors import ReconstructionError
+from pipeline.studies.register.comparing import compare_visits
+from pipeline.studies.register.hardware import painted_over, told_hardware
+from pipeline.studies.register.visit import Look, Visit, teeth_points
+from tests.studies.register_case import MOVED, RADIUS, toy_centres, toy_motions, toy_visit
+
+#: Half of a bracket's width, and how far it stands out, mm.
+HALF, OUT = 1.6, 1.5
+METAL = 0.1
+
+
+def bracketed(look: Look) -> Look:
+    """A black bracket on each crown, where it faces outwards."""
+    image, depth = look.image.copy(), look.depth.copy()
+    moved = toy_motions()
+    for number, centre in toy_centres().items():
+        motion = moved.get(number, np.eye(4))
+        now = motion[:3, :3] @ centre + motion[:3, 3]
+        outwards = (now - (0, now[1], -28)) / np.linalg.norm(now - (0, now[1], -28))
+        away = np.linalg.norm(look.points - (now + RADIUS * outwards), axis=-1)
+        on = (away < HALF) & (look.labels == number)
+        image[on], depth[on] = METAL, depth[on] - OUT
+    return replace(look, image=image, depth=depth)
+
+
+def coloured(look: Look) -> np.ndarray:
+    """[H, W, 3] yellowish enamel, grey metal, red around the crowns."""
+    tint = np.where((look.image > 2 * METAL)[..., None], (1.05, 1.0, 0.8), (1.0, 1.0, 1.0))
+    tint = np.where((look.labels > 0)[..., None], tint, (2.0, 0.6, 0.6))
+    return (look.image[..., None] * tint).astype(np.float32)
+
+
+def visit_of(looks: tuple[Look, ...], told: bool) -> Visit:
+    known = teeth_points(looks)
+    covered = {n: np.median(points, axis=0) for n, points in known.items()} if told else {}
+    if told:
+        looks = tuple(told_hardware(looks, [coloured(look) for look in looks]))
+    return Visit("braces", looks, teeth_points(looks), covered=covered)
+
+
+def test_teeth_are_followed_under_braces_that_were_put_on() -> None:
+    first = toy_visit("before")
+    looks = tuple(bracketed(look) for look in toy_visit("after", toy_motions()).looks)
+    with pytest.raises(ReconstructionError, match="two visits of one patient"):
+        compare_visits(first, visit_of(looks, told=False))
+    found = compare_visits(first, visit_of(looks, told=True))
+    teeth = {tooth.tooth: tooth for tooth in found.teeth}
+    assert set(MOVED) <= set(teeth)
+    for number, (shift, _) in MOVED.items():
+        assert teeth[number].displacement[:3] == pytest.approx(shift, abs=0.3)
+    assert not [n for n, tooth in teeth.items() if tooth.certain and n not in MOVED]
+
+
+def test_what_brackets_cover_is_told_and_painted_over() -> None:
+    (plain,) = toy_visit("plain").looks[1:2]
+    look = bracketed(plain)
+    (told,) = told_hardware([look], [coloured(look)])
+    metal = look.image == np.float32(METAL)
+    assert told.hardware is not None
+    assert told.hardware[metal].mean() > 0.95
+    assert (told.hardware & (look.labels > 0)).sum() < 3 * metal.sum()
+    assert not told.enamel[told.hardware].any()
+    assert np.abs(painted_over(told) - plain.image)[metal].mean() < 0.1
+
+
+def test_teeth_without_braces_stay_as_they_are() -> None:
+    looks = toy_visit("plain").looks
+    assert all(
+        one is other
+        for one, other in zip(
+            told_hardware(looks, [coloured(k) for k in looks]), looks, strict=True
+        )
+    )
+
+
+def test_a_number_that_has_no_place_in_3d_is_left_out() -> None:
+    first, second = toy_visit("one"), toy_visit("two")
+    teeth = {n: points for n, points in first.teeth.items() if n != 15}
+    found = compare_visits(replace(first, teeth=teeth), second)
+    assert 15 not in {tooth.tooth for tooth in found.teeth}
+    assert 15 in found.missing
