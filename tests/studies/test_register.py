@@ -14,7 +14,7 @@ from pipeline.studies.register import comparing, movement, solving
 from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
 from pipeline.studies.register.estimate import Estimate, Started, compared_pairs, started
-from pipeline.studies.register.frame import first_frame
+from pipeline.studies.register.geometry import first_frame
 from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale

@@ -9,8 +9,7 @@ import pytest
 
 from pipeline.errors import ReconstructionError
 from pipeline.studies.register.comparing import compare_visits
-from pipeline.studies.register.hardware import painted_over, told_hardware
-from pipeline.studies.register.visit import Look, Visit, teeth_points
+from pipeline.studies.register.visit import Look, Visit, teeth_points, without_braces
 from tests.studies.register_case import MOVED, RADIUS, toy_centres, toy_motions, toy_visit
 
 #: Half of a bracket's width, and how far it stands out, mm.
@@ -39,20 +38,20 @@ def coloured(look: Look) -> np.ndarray:
     return (look.image[..., None] * tint).astype(np.float32)
 
 
-def visit_of(looks: tuple[Look, ...], told: bool) -> Visit:
-    known = teeth_points(looks)
-    covered = {n: np.median(points, axis=0) for n, points in known.items()} if told else {}
-    if told:
-        looks = tuple(told_hardware(looks, [coloured(look) for look in looks]))
-    return Visit("braces", looks, teeth_points(looks), covered=covered)
+def visit_of(looks: tuple[Look, ...]) -> Visit:
+    return Visit("braces", looks, teeth_points(looks))
+
+
+def told(visit: Visit) -> Visit:
+    return without_braces(visit, [coloured(look) for look in visit.looks])
 
 
 def test_teeth_are_followed_under_braces_that_were_put_on() -> None:
     first = toy_visit("before")
     looks = tuple(bracketed(look) for look in toy_visit("after", toy_motions()).looks)
     with pytest.raises(ReconstructionError, match="two visits of one patient"):
-        compare_visits(first, visit_of(looks, told=False))
-    found = compare_visits(first, visit_of(looks, told=True))
+        compare_visits(first, visit_of(looks))
+    found = compare_visits(first, told(visit_of(looks)))
     teeth = {tooth.tooth: tooth for tooth in found.teeth}
     assert set(MOVED) <= set(teeth)
     for number, (shift, _) in MOVED.items():
@@ -62,24 +61,21 @@ def test_teeth_are_followed_under_braces_that_were_put_on() -> None:
 
 def test_what_brackets_cover_is_told_and_painted_over() -> None:
     (plain,) = toy_visit("plain").looks[1:2]
-    look = bracketed(plain)
-    (told,) = told_hardware([look], [coloured(look)])
+    visit = visit_of((bracketed(plain),))
+    (look,) = told(visit).looks
     metal = look.image == np.float32(METAL)
-    assert told.hardware is not None
-    assert told.hardware[metal].mean() > 0.95
-    assert (told.hardware & (look.labels > 0)).sum() < 3 * metal.sum()
-    assert not told.enamel[told.hardware].any()
-    assert np.abs(painted_over(told) - plain.image)[metal].mean() < 0.1
+    assert look.hardware is not None
+    assert look.hardware[metal].mean() > 0.95
+    assert (look.hardware & (look.labels > 0)).sum() < 3 * metal.sum()
+    assert not look.enamel[look.hardware].any()
+    assert np.abs(look.without_hardware - plain.image)[metal].mean() < 0.1
+    for number, centre in told(visit).centres.items():
+        assert centre == pytest.approx(visit.centres[number]), "metal is part of where a tooth is"
 
 
-def test_teeth_without_braces_stay_as_they_are() -> None:
-    looks = toy_visit("plain").looks
-    assert all(
-        one is other
-        for one, other in zip(
-            told_hardware(looks, [coloured(k) for k in looks]), looks, strict=True
-        )
-    )
+def test_a_visit_without_braces_stays_as_it_is() -> None:
+    visit = toy_visit("plain")
+    assert told(visit) is visit
 
 
 def test_a_number_that_has_no_place_in_3d_is_left_out() -> None:

@@ -13,8 +13,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.studies.register import solving
 from pipeline.studies.register.both_ways import both_ways, mirrored
 from pipeline.studies.register.estimate import Estimate
-from pipeline.studies.register.frame import first_frame
-from pipeline.studies.register.geometry import inverted, refined_frame
+from pipeline.studies.register.geometry import first_frame, inverted, refined_frame
 from pipeline.studies.register.movement import to_parts, tooth_axes
 from pipeline.studies.register.uncertainty import RANGE, measured, misfit
 from pipeline.studies.register.visit import Visit, scale_of

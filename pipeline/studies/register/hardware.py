@@ -4,18 +4,16 @@ of what the tooth did."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.studies.register.visit import Look
-
 Floats = npt.NDArray[np.float32]
+Labels = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
-#: A visit has braces if they cover such a share of its crowns. Of a patient with braces .16, of 20
+#: A visit has braces if they cover such a share of its crowns. Of a patient with braces .17, of 20
 #: generated mouths with them .07 to .37; of eleven patients without .03 at most, all photographs
 #: together, and of the generated mouths .03.
 LEAST_SHARE = 0.06
@@ -26,55 +24,52 @@ SURE, AROUND = 0.3, 0.4
 PAINT = 1.0
 
 
-def told_hardware(looks: Sequence[Look], pictures: Sequence[Floats]) -> list[Look]:
-    """The photographs of a visit with braces, with what their brackets and wires cover.
+def braces_in(
+    pictures: Sequence[Floats], labels: Sequence[Labels], densities: Sequence[float]
+) -> list[Mask] | None:
+    """What brackets and wires cover in the photographs of a visit; None where there are no braces.
 
     Args:
-        looks: photographs, in mm.
-        pictures: [H, W, 3] float32 sRGB in 0..1 of each.
+        pictures: [H, W, 3] float32 sRGB in 0..1 of each photograph.
+        labels: [H, W] uint8 of each, the number of the crown at each pixel, 0: none.
+        densities: pixels per mm on the crowns of each; 0 where that is not known.
 
     Returns:
-        The looks, their `hardware` filled in; as they are where there are no braces.
+        [H, W] bool for each.
     """
-    masks = [_hardware(look, picture) for look, picture in zip(looks, pictures, strict=True)]
-    covered = sum(
-        int((mask & (look.labels > 0)).sum()) for mask, look in zip(masks, looks, strict=True)
-    )
-    crowns = sum(int((look.labels > 0).sum()) for look in looks)
-    if covered < LEAST_SHARE * max(crowns, 1):
-        return list(looks)
-    return [
-        replace(look, hardware=_grown(mask, AROUND * _density(look)))
-        for mask, look in zip(masks, looks, strict=True)
-    ]
+    masks = [_hardware(*each) for each in zip(pictures, labels, densities, strict=True)]
+    pairs = list(zip(masks, labels, strict=True))
+    covered = sum(int((mask & (numbers > 0)).sum()) for mask, numbers in pairs)
+    if covered < LEAST_SHARE * max(sum(int((k > 0).sum()) for k in labels), 1):
+        return None
+    return [_grown(mask, AROUND * near) for mask, near in zip(masks, densities, strict=True)]
 
 
-def painted_over(look: Look) -> Floats:
-    """[H, W] the photograph with the enamel around it in place of hardware."""
-    if look.hardware is None or not _density(look):
-        return look.image
-    enamel = (look.enamel > 0).astype(np.float32)
-    blur = (0, 0), PAINT * _density(look)
-    mass = np.maximum(cv2.GaussianBlur(enamel, *blur), 1e-6)
-    paint = cv2.GaussianBlur(look.image * enamel, *blur) / mass
-    return np.where(look.hardware, paint, look.image).astype(np.float32)
+def painted_over(image: Floats, hardware: Mask, enamel: Mask, density: float) -> Floats:
+    """[H, W] a grey photograph with the enamel around it in place of hardware.
+
+    Args:
+        image: [H, W] float32.
+        hardware, enamel: [H, W] bool.
+        density: pixels per mm.
+    """
+    if not density:
+        return image
+    weight = enamel.astype(np.float32)
+    blur = (0, 0), PAINT * density
+    mass = np.maximum(cv2.GaussianBlur(weight, *blur), 1e-6)
+    paint = cv2.GaussianBlur(image * weight, *blur) / mass
+    return np.where(hardware, paint, image).astype(np.float32)
 
 
-def _density(look: Look) -> float:
-    """Pixels per mm on the crowns; 0 where none is known."""
-    depth = look.depth[(look.labels > 0) & (look.depth > 0)]
-    return look.camera.fx / float(np.median(depth)) if len(depth) else 0.0
-
-
-def _hardware(look: Look, picture: Floats) -> Mask:
+def _hardware(picture: Floats, labels: Labels, density: float) -> Mask:
     from stages.init.dental.surface.photos.tissue import find_hardware
 
-    density = _density(look)
     if not density:
-        return np.zeros(look.labels.shape, bool)
+        return np.zeros(labels.shape, bool)
     lab = cv2.cvtColor(np.ascontiguousarray(picture, np.float32), cv2.COLOR_RGB2Lab)
     lab = (lab * np.array([2.55, 1, 1])).astype(np.float32)
-    return np.asarray(find_hardware(lab, look.labels > 0, density) > SURE)
+    return np.asarray(find_hardware(lab, labels > 0, density) > SURE)
 
 
 def _grown(mask: Mask, radius: float) -> Mask:

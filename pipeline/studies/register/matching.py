@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.studies.register.hardware import painted_over
 from pipeline.studies.register.visit import Floats, Labels, Look
 
 Array = npt.NDArray[np.float64]
@@ -110,7 +109,7 @@ def prepare(look: Look) -> Prepared:
     from stages.flow.estimate import local_contrast
 
     scale = max(look.image.shape) / 512
-    dull, shiny = without_shine(painted_over(look), scale)
+    dull, shiny = without_shine(look.without_hardware, scale)
     gray = np.clip(np.rint(dull * 255), 0, 255).astype(np.uint8)
     contrast = local_contrast(gray, CONTRAST * scale)
     labels = look.enamel

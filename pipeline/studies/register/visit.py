@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from pipeline.artifacts.dental.sizes import millimetres_per_unit
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.errors import RequestError
 from pipeline.geometry.similarity import moved_camera
+from pipeline.studies.register.hardware import braces_in, painted_over
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -55,6 +56,19 @@ class Look:
         if self.hardware is None:
             return self.labels
         return np.where(self.hardware, 0, self.labels).astype(np.uint8)
+
+    @property
+    def density(self) -> float:
+        """Pixels per mm on the crowns; 0 where no depth is known."""
+        depth = self.depth[(self.labels > 0) & (self.depth > 0)]
+        return self.camera.fx / float(np.median(depth)) if len(depth) else 0.0
+
+    @property
+    def without_hardware(self) -> Floats:
+        """[H, W] `image` with enamel painted over hardware."""
+        if self.hardware is None:
+            return self.image
+        return painted_over(self.image, self.hardware, self.enamel > 0, self.density)
 
     @cached_property
     def points(self) -> Array:
@@ -115,7 +129,6 @@ def read_visit(workspace: Path) -> Visit:
     Raises:
         RequestError: no run, an unfinished one, or one without teeth.
     """
-    from pipeline.studies.register.hardware import told_hardware
     from pipeline.studies.report.reading import read_case
     from stages.splatting.rendering import render
 
@@ -164,10 +177,23 @@ def read_visit(workspace: Path) -> Visit:
         percent, source = 100 * TEXTBOOK_DEVIATION, SOURCES["textbook_teeth"]
     made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians)
     made = made.in_frame(frame)
-    told = tuple(told_hardware(made.looks, pictures))
-    if any(look.hardware is not None for look in told):
-        made = replace(made, looks=told, teeth=teeth_points(told), covered=made.centres)
+    made = without_braces(made, pictures)
     return replace(made, scale_percent=float(percent or 0.0), scale_source=source)
+
+
+def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:
+    """The visit with its brackets and wires told, if it has some: they belong to no crown.
+
+    Args:
+        visit: in mm.
+        pictures: [H, W, 3] float32 sRGB in 0..1 of each of its photographs.
+    """
+    labels, densities = ([getattr(k, name) for k in visit.looks] for name in ("labels", "density"))
+    found = braces_in(pictures, labels, densities)
+    if found is None:
+        return visit
+    looks = tuple(replace(k, hardware=h) for k, h in zip(visit.looks, found, strict=True))
+    return replace(visit, looks=looks, teeth=teeth_points(looks), covered=visit.centres)
 
 
 #: Where a run's millimetres come from, in words, by `Scale.source`.
