@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
+from stages.dentition.corrections import area
 from stages.teeth.read import Reading, row_extent
 
 Array32 = npt.NDArray[np.float32]
@@ -92,7 +93,7 @@ def usual_score(dentition: Dentition) -> float:
     with brackets on them; of a house the large ones score low as well.
     """
     scores = np.array([crown.score for crown in dentition.all_crowns])
-    areas = [cv2.contourArea(crown.outline.astype(np.float32)) for crown in dentition.all_crowns]
+    areas = [area(crown.outline) for crown in dentition.all_crowns]
     order = np.argsort(scores)
     below = np.cumsum(np.array(areas)[order])
     return float(scores[order][np.searchsorted(below, below[-1] / 2)])

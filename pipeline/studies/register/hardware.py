@@ -63,16 +63,14 @@ def painted_over(image: Floats, hardware: Mask, enamel: Mask, density: float) ->
 
 
 def _hardware(picture: Floats, labels: Labels, density: float) -> Mask:
-    from stages.init.dental.surface.photos.tissue import find_hardware
+    from stages.init.dental.surface.photos.tissue import eight_bit_lab, find_hardware
 
     if not density:
         return np.zeros(labels.shape, bool)
-    lab = cv2.cvtColor(np.ascontiguousarray(picture, np.float32), cv2.COLOR_RGB2Lab)
-    lab = (lab * np.array([2.55, 1, 1])).astype(np.float32)
-    return np.asarray(find_hardware(lab, labels > 0, density) > SURE)
+    return np.asarray(find_hardware(eight_bit_lab(picture), labels > 0, density) > SURE)
 
 
 def _grown(mask: Mask, radius: float) -> Mask:
-    size = 2 * max(round(radius), 1) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+    from stages.init.dental.surface.photos.tissue import disc
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(round(radius))) > 0)

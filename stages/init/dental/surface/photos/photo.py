@@ -11,7 +11,12 @@ import numpy.typing as npt
 from pipeline.artifacts.dental.fdi import Jaw
 from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import PlacedView
-from stages.init.dental.surface.photos.tissue import find_gum, find_hardware, find_void
+from stages.init.dental.surface.photos.tissue import (
+    eight_bit_lab,
+    find_gum,
+    find_hardware,
+    find_void,
+)
 from stages.stereo.appearance import highlights
 
 Array32 = npt.NDArray[np.float32]
@@ -188,7 +193,7 @@ def prepare_photo(
         [*pose[:3, :3].ravel(), *pose[:3, 3], placed.focal, width / 2, height / 2], np.float64
     )
     density = placed.focal / max(float(pose[2, :3] @ middle + pose[2, 3]), 1.0)
-    lab = _lab(image)
+    lab = eight_bit_lab(image)
     tooth = dentition.mask & valid
     void = find_void(lab[..., 0], tooth, density)
     shiny = highlights(image)
@@ -210,12 +215,6 @@ def prepare_photo(
         hardware=find_hardware(lab, tooth, density),
         valid=valid,
     )
-
-
-def _lab(image: Array32) -> Array32:
-    """CIE Lab [H, W, 3] float32, each channel scaled as in 8-bit images (L 0..255)."""
-    lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(image, np.float32), cv2.COLOR_RGB2Lab))
-    return np.asarray(lab * np.array([2.55, 1, 1], np.float32), np.float32)
 
 
 def _texture(lab: Array32, density: float) -> Array32:

@@ -45,6 +45,12 @@ _RED, _RED_SURE = 12.0, 6.0
 _PARTED = 1.5
 
 
+def eight_bit_lab(image: Array32) -> Array32:
+    """CIE Lab [H, W, 3] float32, each channel scaled as in 8-bit images (L 0..255)."""
+    lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(image, np.float32), cv2.COLOR_RGB2Lab))
+    return np.asarray(lab * np.array([2.55, 1, 1], np.float32), np.float32)
+
+
 def find_gum(
     lab: Array32,
     tooth: Mask,
