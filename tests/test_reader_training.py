@@ -29,7 +29,8 @@ def sample(numbered: bool = True) -> Sample:
         teeth[y : y + 40, x : x + 35] = tooth
         image[y : y + 40, x : x + 35] = 150 + tooth
     numbers = teeth if numbered else np.where(teeth > 0, UNNUMBERED, 0).astype(np.uint8)
-    return Sample("made", image, teeth, numbers, distance_inside(teeth), 0, 0)
+    told = np.ones_like(teeth)
+    return Sample("made", image, teeth, numbers, distance_inside(teeth), told, 0, 0)
 
 
 def test_mirrored_numbers_are_their_own_inverse() -> None:
@@ -76,7 +77,7 @@ def test_unknown_numbers_teach_nothing_of_numbers() -> None:
     torch.manual_seed(0)
     net = Reader()
     known, unknown = (collate([example(sample(n), None)]) for n in (True, False))
-    answer, kind = net.eval()(known["image"])
+    answer, kind = net.eval()(known["image"].float())
     parts = [losses(answer, kind, batch) for batch in (known, unknown)]
     assert parts[0]["jaw"] > 0 and not {"jaw", "side", "primary", "position"} & set(parts[1])
     assert torch.isclose(parts[0]["tooth"], parts[1]["tooth"])
@@ -103,7 +104,7 @@ def test_a_few_steps_learn_something() -> None:
     optimiser = torch.optim.AdamW(net.parameters(), 3e-3)
     totals = []
     for _ in range(6):
-        total = sum(losses(*net(batch["image"]), batch).values())
+        total = sum(losses(*net(batch["image"].float()), batch).values())
         optimiser.zero_grad()
         total.backward()
         optimiser.step()

@@ -1,6 +1,7 @@
 """Write many photographs with their labels into a folder.
 
-    python data_samples/mouths/__main__.py --count N --out FOLDER [--seed S] [--jobs J]
+    python data_samples/mouths/__main__.py --count N --out FOLDER
+        [--seed S] [--jobs J] [--patients WHOSE]
 
 Photograph k is `k.jpg`, with its labels (FDI numbers) in `k.png`; `index.json` says what
 each shows.
@@ -25,13 +26,39 @@ from .cameras import ROLES
 from .mouth import Mouth, random_mouth
 from .photo import Photograph, photograph
 
+PATIENTS = ("anybody", "orthodontic", "children")
+#: So many of the orthodontic patients wear braces.
+BRACES = 0.7
+#: Of the roles of `cameras.ROLES`.
 SHARES = (0.40, 0.22, 0.22, 0.08, 0.08)
 
 
-def photographs_of(number: int, seed: int, width: int) -> list[tuple[Mouth, Photograph]]:
-    """Three or four photographs of one mouth."""
+def options_of(patients: str, rng: np.random.Generator) -> dict[str, Any]:
+    """What is chosen of a mouth because of whose it is (one of `PATIENTS`); the rest is random.
+
+    Orthodontic patients: most wear braces, and arches range from narrow to wide and from a parabola
+    to a U.
+    """
+    if patients == "children":
+        return {"dentition": str(rng.choice(["primary", "mixed"]))}
+    if patients == "orthodontic":
+        braces = rng.random() < BRACES
+        return {
+            "dentition": "permanent",
+            "arch_width": float(rng.normal(1.0, 0.08)),
+            "arch_power": float(rng.uniform(2.0, 3.3)),
+            "braces_upper": bool(braces),
+            "braces_lower": bool(braces and rng.random() < 0.75),
+        }
+    return {}
+
+
+def photographs_of(
+    number: int, seed: int, width: int, patients: str = "anybody"
+) -> list[tuple[Mouth, Photograph]]:
+    """Three or four photographs of one mouth, of one of `PATIENTS`."""
     rng = np.random.default_rng([seed, number])
-    mouth = random_mouth(rng)
+    mouth = random_mouth(rng, **options_of(patients, rng))
     result = []
     for _ in range(int(rng.integers(3, 5))):
         role = str(rng.choice(ROLES, p=SHARES))
@@ -42,10 +69,10 @@ def photographs_of(number: int, seed: int, width: int) -> list[tuple[Mouth, Phot
 
 
 def photographs(
-    wanted: int, seed: int, width: int, jobs: int = 1
+    wanted: int, seed: int, width: int, jobs: int = 1, patients: str = "anybody"
 ) -> Iterator[tuple[Mouth, Photograph]]:
     """Yield so many photographs, made by so many processes."""
-    made = partial(photographs_of, seed=seed, width=width)
+    made = partial(photographs_of, seed=seed, width=width, patients=patients)
     if jobs < 2:
         yield from islice(chain.from_iterable(map(made, count())), wanted)
         return
@@ -85,10 +112,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=448, help="of the pictures, pixels")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--patients", choices=PATIENTS, default=PATIENTS[0], help="whose mouths")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     index = {}
-    made = photographs(options.count, options.seed, options.width, options.jobs)
+    made = photographs(options.count, options.seed, options.width, options.jobs, options.patients)
     for k, (mouth, photo) in enumerate(made):
         cv2.imwrite(
             str(options.out / f"{k}.jpg"), photo.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93]

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from brackets import draw_braces
 from network import CENTRE_UNIT, HEIGHT, WIDTH
 from samples import MIRRORED, UNNUMBERED, Sample
 
 Array = npt.NDArray[np.float32]
 #: Brightness 0..1 is brought to about zero mean and unit spread.
 MEAN, SPREAD = 0.45, 0.25
+#: So many photographs get braces drawn onto them.
+BRACES = 0.2
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Example:
         centre: [2, h, w] float32 offset to the crown's centre in units.
         crowns: [h, w] uint8 one number per crown, 0: no tooth.
         number: [h, w] uint8 FDI, `UNNUMBERED` or 0.
-        valid: [h, w] float32: inside the photograph.
+        valid: [h, w] float32: inside the photograph, where the labels say something.
         view, bite: as in `Sample`.
     """
 
@@ -134,40 +137,6 @@ def _probe(image: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArra
     return mask
 
 
-def _braces(
-    image: npt.NDArray[np.uint8], sample: Sample, transform: npt.NDArray[np.float64],
-    rng: np.random.Generator,
-) -> None:  # fmt: skip
-    """Brackets on the crowns and a wire between them, in place; what they hide stays tooth."""
-    crowns = sample.crowns
-    jaws: dict[bool, list[npt.NDArray]] = {True: [], False: []}
-    centres = []
-    for number in np.unique(crowns)[1:]:
-        rows, columns = np.nonzero(crowns == number)
-        centres.append((columns.mean(), rows.mean(), np.sqrt(len(rows))))
-    if len(centres) < 6:
-        return
-    middle = float(np.median([c[1] for c in centres]))
-    for x, y, size in centres:
-        point = transform[:, :2] @ [x, y] + transform[:, 2]
-        jaws[y < middle].append(
-            np.array([*point, size * np.sqrt(abs(np.linalg.det(transform[:, :2])))])
-        )
-    shade = int(rng.integers(25, 210))
-    colour = (shade, shade, min(255, shade + 8))
-    for row in jaws.values():
-        if rng.random() < 0.4 or len(row) < 3:
-            continue
-        row.sort(key=lambda c: c[0])
-        path = np.array(row)[:, :2].astype(np.int32)
-        cv2.polylines(image, [path], False, colour, 1 + int(rng.random() < 0.3), cv2.LINE_AA)
-        for x, y, size in row:
-            half = 0.16 * size * rng.uniform(0.8, 1.2)
-            box = cv2.boxPoints(((x, y), (2 * half, 1.8 * half), rng.normal(0, 8)))
-            cv2.fillPoly(image, [box.astype(np.int32)], colour, cv2.LINE_AA)
-            cv2.circle(image, (int(x), int(y)), max(1, int(half / 3)), (230, 230, 230), -1)
-
-
 def example(sample: Sample, rng: np.random.Generator | None) -> Example:
     """A photograph as the network sees it.
 
@@ -195,23 +164,26 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
     tooth = cv2.warpAffine((sample.teeth > 0).astype(np.float32), half, small)
     ones = np.ones(shape, np.uint8)
     seen = cv2.warpAffine(ones, whole, size, flags=cv2.INTER_NEAREST)
+    told = cv2.warpAffine(sample.told, half, small, flags=cv2.INTER_NEAREST)
     view, bite = sample.view, sample.bite
     if rng is not None:
-        image = _relit(np.ascontiguousarray(image), rng)
-        if rng.random() < 0.12:
-            _braces(image, sample, transform, rng)
+        image = np.ascontiguousarray(image)
+        if rng.random() < BRACES:
+            draw_braces(image, sample, transform, rng)
+        image = _relit(image, rng)
         if rng.random() < 0.15:
             hidden = cv2.resize(_probe(image, rng), small, interpolation=cv2.INTER_AREA) > 0
             tooth[hidden], inside[hidden], number[hidden], crowns[hidden] = 0, 0, 0, 0
     if flip:
-        image, inside, crowns, tooth, seen = (
-            np.ascontiguousarray(part[:, ::-1]) for part in (image, inside, crowns, tooth, seen)
+        image, inside, crowns, tooth, seen, told = (
+            np.ascontiguousarray(part[:, ::-1])
+            for part in (image, inside, crowns, tooth, seen, told)
         )
         number = MIRRORED[number[:, ::-1]]
         view = {1: 2, 2: 1}.get(view, view)
     if rng is not None and rng.random() < 0.08:
-        image, inside, crowns, tooth, seen = (
-            np.ascontiguousarray(part[::-1]) for part in (image, inside, crowns, tooth, seen)
+        image, inside, crowns, tooth, seen, told = (
+            np.ascontiguousarray(part[::-1]) for part in (image, inside, crowns, tooth, seen, told)
         )
         number = np.where(number[::-1] > 0, UNNUMBERED, 0).astype(np.uint8)
         view = bite = -1
@@ -224,7 +196,7 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
         centre=_offsets(crowns),
         crowns=np.ascontiguousarray(crowns),
         number=np.ascontiguousarray(number),
-        valid=seen[::2, ::2].astype(np.float32),
+        valid=(seen[::2, ::2] * told).astype(np.float32),
         view=view,
         bite=bite,
     )

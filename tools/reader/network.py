@@ -70,7 +70,7 @@ class Reader(nn.Module):
     wider view than the outlines need.
     """
 
-    def __init__(self, widths: tuple[int, ...] = (16, 32, 64, 128, 160), meaning: int = 48) -> None:
+    def __init__(self, widths: tuple[int, ...] = (24, 48, 96, 160, 224), meaning: int = 64) -> None:
         super().__init__()
         a, b, c, d, e = widths
         self.stem = nn.Sequential(convolution(3, a, 2, 5), convolution(a, a))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +35,7 @@ class Sample:
         crowns: [H, W] uint8, one number per crown, 0: no tooth.
         teeth: [H, W] uint8 FDI numbers; `UNNUMBERED` where not known, 0: no tooth.
         inside: [H, W] uint8: distance to the crown's own border, 255 at its middle.
+        told: [H, W] uint8, 0 where the labels say nothing (`unlabelled`), else 1.
         view: index into `network.VIEWS`, -1: unknown.
         bite: 0 closed, 1 open, -1 unknown.
     """
@@ -43,6 +45,7 @@ class Sample:
     crowns: npt.NDArray[np.uint8]
     teeth: npt.NDArray[np.uint8]
     inside: npt.NDArray[np.uint8]
+    told: npt.NDArray[np.uint8]
     view: int
     bite: int
 
@@ -68,20 +71,23 @@ def distance_inside(crowns: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 def _sample(
     name: str, image: npt.NDArray[np.uint8], crowns: npt.NDArray[np.uint8],
-    teeth: npt.NDArray[np.uint8], view: int, bite: int,
+    teeth: npt.NDArray[np.uint8], told: npt.NDArray[np.uint8] | None, view: int, bite: int,
 ) -> Sample:  # fmt: skip
+    told = np.ones_like(crowns) if told is None else told
     scale = LONG_SIDE / max(image.shape[:2])
     if scale < 1:
         size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         crowns = cv2.resize(crowns, size, interpolation=cv2.INTER_NEAREST)
         teeth = cv2.resize(teeth, size, interpolation=cv2.INTER_NEAREST)
-    return Sample(name, image, crowns, teeth, distance_inside(crowns), view, bite)
+        told = cv2.resize(told, size, interpolation=cv2.INTER_NEAREST)
+    return Sample(name, image, crowns, teeth, distance_inside(crowns), told, view, bite)
 
 
 def read_labelled(
-    folder: Path, split: str, views: tuple[str, ...], extra: Path | None = None
-) -> list[Sample]:
+    folder: Path, split: str, views: tuple[str, ...], extra: Path | None = None,
+    unlabelled: Path | None = None,
+) -> list[Sample]:  # fmt: skip
     """The photographs of `split` with an outline per tooth, and numbers where they are known.
 
     Args:
@@ -89,16 +95,17 @@ def read_labelled(
         split: `train` or `valid`.
         views: names of the kinds of photographs.
         extra: further numbers in the form of `fdi.json`.
+        unlabelled: folder that says where teeth have no outline (`unlabelled.py`).
     """
     known = json.loads((folder / "fdi.json").read_text())
     if extra is not None:
         known = {**json.loads(extra.read_text()), **known}
-    samples = []
-    for path in sorted((folder / split).glob("*.png")):
+
+    def read(path: Path) -> Sample | None:
         image = cv2.imread(str(path.with_suffix(".jpg")))
         crowns = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None or min(image.shape[:2]) < LEAST_SIDE:
-            continue
+            return None
         label = known.get(f"{split}/{path.stem}", {})
         numbers = np.full(256, UNNUMBERED, np.uint8)
         numbers[0] = 0
@@ -110,26 +117,32 @@ def read_labelled(
             quadrants = {int(tooth) // 10 for tooth in label["fdi"].values()}
             view = "upper" if quadrants <= {1, 2, 5, 6} else "lower"
         bite = {"closed": 0, "open": 1}.get(label.get("bite", ""), -1)
-        samples.append(
-            _sample(
-                f"{split}/{path.stem}", np.ascontiguousarray(image[..., ::-1]), crowns,
-                numbers[crowns], views.index(view) if view in views else -1, bite,
-            )
+        told = None
+        if unlabelled is not None:
+            hidden = cv2.imread(str(unlabelled / path.name), cv2.IMREAD_GRAYSCALE)
+            told = (hidden == 0).astype(np.uint8)
+        return _sample(
+            f"{split}/{path.stem}", np.ascontiguousarray(image[..., ::-1]), crowns,
+            numbers[crowns], told, views.index(view) if view in views else -1, bite,
         )  # fmt: skip
-    return samples
+
+    with ThreadPoolExecutor() as pool:
+        samples = pool.map(read, sorted((folder / split).glob("*.png")))
+        return [sample for sample in samples if sample is not None]
 
 
 def read_generated(folder: Path, views: tuple[str, ...]) -> list[Sample]:
     """Photographs of generated mouths (`data_samples/mouths`): every number is known."""
     index = json.loads((folder / "index.json").read_text())
-    samples = []
-    for name, entry in sorted(index.items()):
+
+    def read(name: str) -> Sample:
         image = cv2.imread(str(folder / f"{name}.jpg"))
         teeth = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        samples.append(
-            _sample(
-                name, np.ascontiguousarray(image[..., ::-1]), teeth, teeth,
-                views.index(entry["view"]), {"closed": 0, "open": 1}[entry["bite"]],
-            )
+        entry = index[name]
+        return _sample(
+            name, np.ascontiguousarray(image[..., ::-1]), teeth, teeth, None,
+            views.index(entry["view"]), {"closed": 0, "open": 1}[entry["bite"]],
         )  # fmt: skip
-    return samples
+
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(read, sorted(index)))

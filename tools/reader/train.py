@@ -1,9 +1,10 @@
 """Train the tooth reader.
 
-    python tools/reader/train.py --data teeth_labelled --mouths FOLDER --steps 9000 --out reader.pt
+    python tools/reader/train.py --data teeth_labelled --mouths FOLDER ... --out reader.pt
 
-Two cores with bfloat16 units (AMX) take about .25 s a step of 8; without them, about 1 s. The same
-seed, data, versions and kind of processor give the same weights.
+A card (`--device cuda`) makes 10 steps of 64 a second if 15 processes make examples for it
+(`--workers`); it adds in any order, so that weights differ a little from run to run. Two cores take
+about 10 s a step; there the same seed, data, versions and kind of processor give the same weights.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import copy
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from augment import Example, example
@@ -39,10 +41,28 @@ PRIMARY_WEIGHT = 3.0
 #: How often a photograph is drawn: one whose teeth have numbers, and one of those from the side,
 #: which are rare and show what tells a molar from a premolar.
 NUMBERED, NUMBERED_SIDE = 2.0, 5.0
+#: How much oftener one that shows primary teeth.
+WITH_PRIMARY = 2.0
 #: How often a generated photograph from the side is drawn.
 GENERATED_SIDE = 1.5
+#: Share of certainty that no place gets: what one sees of a last molar may belong to its neighbour.
+SMOOTHING = 0.08
+#: Steps from one look at the losses to the next.
+TOLD = 5
 #: Crowns of fewer pixels of the answer teach no numbers.
 LEAST_PIXELS = 12
+#: Views from the side.
+SIDES = {VIEWS.index("right"), VIEWS.index("left")}
+
+
+def how_often(sample: Sample) -> float:
+    """How often a labelled photograph is drawn."""
+    teeth = sample.teeth[sample.teeth > 0]
+    numbered = teeth != UNNUMBERED
+    if numbered.mean() <= 0.5:
+        return 1.0
+    weight = NUMBERED_SIDE if sample.view in SIDES else NUMBERED
+    return weight * (WITH_PRIMARY if (teeth[numbered] > 50).any() else 1.0)
 
 
 class Stream(torch.utils.data.IterableDataset):
@@ -52,19 +72,14 @@ class Stream(torch.utils.data.IterableDataset):
         self, real: list[Sample], generated: list[Sample], share: float, seed: int
     ) -> None:
         self.real, self.generated, self.share, self.seed = real, generated, share, seed
-        sides = {VIEWS.index("right"), VIEWS.index("left")}
-        weights = [
-            (NUMBERED_SIDE if sample.view in sides else NUMBERED)
-            if (sample.teeth[sample.teeth > 0] != UNNUMBERED).mean() > 0.5
-            else 1.0
-            for sample in real
-        ]
+        weights = [how_often(sample) for sample in real]
         self.weights = np.array(weights) / sum(weights)
-        made = [GENERATED_SIDE if sample.view in sides else 1.0 for sample in generated]
+        made = [GENERATED_SIDE if sample.view in SIDES else 1.0 for sample in generated]
         self.made_weights = np.array(made) / max(sum(made), 1.0)
 
     def __iter__(self):
-        rng = np.random.default_rng(self.seed)
+        worker = torch.utils.data.get_worker_info()
+        rng = np.random.default_rng([self.seed, 0 if worker is None else worker.id])
         while True:
             if self.generated and rng.random() < self.share:
                 sample = self.generated[rng.choice(len(self.generated), p=self.made_weights)]
@@ -74,14 +89,15 @@ class Stream(torch.utils.data.IterableDataset):
 
 
 def collate(examples: list[Example]) -> dict[str, Tensor]:
-    """Examples side by side."""
+    """Examples side by side; the images in half precision, which halves what processes pass on."""
     fields = (
         "image", "tooth", "inside", "border", "centre", "crowns", "number", "valid", "view", "bite",
     )  # fmt: skip
-    return {
+    batch = {
         name: torch.from_numpy(np.stack([np.asarray(getattr(e, name)) for e in examples]))
         for name in fields
     }
+    return batch | {"image": batch["image"].half()}
 
 
 def crown_means(answer: Tensor, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -91,15 +107,17 @@ def crown_means(answer: Tensor, batch: dict[str, Tensor]) -> tuple[Tensor, Tenso
         [n, 11] means of the logits over the crowns, and their [n] FDI numbers.
     """
     count = len(answer)
-    place = batch["crowns"].long() + 256 * torch.arange(count)[:, None, None]
-    weight = (batch["inside"] + 1e-3) * (batch["crowns"] > 0)
-    sums = torch.zeros(256 * count, MEANINGS + 1)
-    logits = torch.cat([answer[:, SHAPES:], torch.ones_like(answer[:, :1])], 1)
-    logits = logits.permute(0, 2, 3, 1).reshape(-1, MEANINGS + 1) * weight.reshape(-1, 1)
-    sums = sums.index_add(0, place.reshape(-1), logits)
-    pixels = torch.bincount(place.reshape(-1), minlength=256 * count)
-    number = torch.zeros(256 * count, dtype=torch.long)
-    number[place.reshape(-1)] = batch["number"].long().reshape(-1)
+    device = answer.device
+    on_crown = batch["crowns"] > 0
+    place = batch["crowns"].long() + 256 * torch.arange(count, device=device)[:, None, None]
+    place = place[on_crown]
+    weight = batch["inside"][on_crown] + 1e-3
+    logits = answer[:, SHAPES:].permute(0, 2, 3, 1)[on_crown]
+    logits = torch.cat([logits, torch.ones_like(logits[:, :1])], 1) * weight[:, None]
+    sums = torch.zeros(256 * count, MEANINGS + 1, device=device).index_add(0, place, logits)
+    pixels = torch.bincount(place, minlength=256 * count)
+    number = torch.zeros(256 * count, dtype=torch.long, device=device)
+    number[place] = batch["number"][on_crown].long()
     chosen = (pixels >= LEAST_PIXELS) & (number > 0) & (number != UNNUMBERED)
     return sums[chosen, :MEANINGS] / sums[chosen, MEANINGS:], number[chosen]
 
@@ -113,8 +131,9 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
     dice = 1 - (2 * (share * tooth).sum((1, 2)) + 1) / (share.sum((1, 2)) + tooth.sum((1, 2)) + 1)
     inside = (torch.sigmoid(answer[:, INSIDE]) - batch["inside"]).abs() * valid * (0.3 + tooth)
     border = F.binary_cross_entropy_with_logits(
-        answer[:, BORDER], batch["border"], reduction="none", pos_weight=torch.tensor(4.0)
-    )
+        answer[:, BORDER], batch["border"], reduction="none",
+        pos_weight=torch.tensor(4.0, device=answer.device),
+    )  # fmt: skip
     on_tooth = (batch["number"] > 0).float()
     centre = (answer[:, CENTRE] - batch["centre"]).abs().sum(1) * on_tooth
     result = {
@@ -129,8 +148,9 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
 
         def binary(channel: int, truth: Tensor, weight: float = 1.0) -> Tensor:
             return F.binary_cross_entropy_with_logits(
-                means[:, channel - SHAPES], truth.float(), pos_weight=torch.tensor(weight)
-            )
+                means[:, channel - SHAPES], truth.float(),
+                pos_weight=torch.tensor(weight, device=means.device),
+            )  # fmt: skip
 
         left = (quadrant == 2) | (quadrant == 3) | (quadrant == 6) | (quadrant == 7)
         lower = (quadrant == 3) | (quadrant == 4) | (quadrant >= 7)
@@ -140,7 +160,7 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
             "side": 0.3 * binary(SIDE, left),
             "primary": 0.3 * binary(PRIMARY, quadrant >= 5, PRIMARY_WEIGHT),
             "position": 0.6
-            * F.cross_entropy(places, (number % 10 - 1).clamp(0, 7), label_smoothing=0.02),
+            * F.cross_entropy(places, (number % 10 - 1).clamp(0, 7), label_smoothing=SMOOTHING),
         }
     if (batch["view"] >= 0).any():
         views = torch.where(batch["view"] >= 0, batch["view"], -100)
@@ -156,7 +176,8 @@ def losses(answer: Tensor, kind: Tensor, batch: dict[str, Tensor]) -> dict[str, 
 @torch.no_grad()
 def validate(net: Reader, batch: dict[str, Tensor]) -> str:
     """Figures on photographs that were not learned from."""
-    parts = [net(batch["image"][k : k + 16]) for k in range(0, len(batch["image"]), 16)]
+    images = batch["image"].float()
+    parts = [net(images[k : k + 16]) for k in range(0, len(images), 16)]
     answer, kind = torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
     found = (answer[:, TOOTH] > 0) & (batch["valid"] > 0)
     truth = batch["tooth"] > 0.5
@@ -187,34 +208,42 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of teeth_labelled")
     parser.add_argument("--labels", type=Path, help="further tooth numbers (as fdi.json)")
-    parser.add_argument("--mouths", type=Path, help="folder of generated mouths")
+    parser.add_argument("--unlabelled", type=Path, help="folder that unlabelled.py wrote")
+    parser.add_argument("--mouths", type=Path, nargs="*", help="folders of generated mouths")
     parser.add_argument("--share", type=float, default=0.4, help="share of generated mouths")
     parser.add_argument("--out", type=Path, default=Path("reader.pt"))
     parser.add_argument("--start", type=Path, help="weights to go on from")
-    parser.add_argument("--steps", type=int, default=9000)
-    parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--rate", type=float, default=3e-3)
+    parser.add_argument("--steps", type=int, default=5500)
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--rate", type=float, default=4e-3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--workers", type=int, default=1, help="processes that make examples")
     arguments = parser.parse_args()
 
+    # Before OpenCV starts threads: processes that are forked from it then would wait for them.
+    cv2.setNumThreads(1)
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
-    real = read_labelled(arguments.data, "train", VIEWS, arguments.labels)
+    device = arguments.device
+    real = read_labelled(arguments.data, "train", VIEWS, arguments.labels, arguments.unlabelled)
     held_out = read_labelled(arguments.data, "valid", VIEWS)
-    generated = read_generated(arguments.mouths, VIEWS) if arguments.mouths else []
+    generated = [s for folder in arguments.mouths or [] for s in read_generated(folder, VIEWS)]
     print(f"{len(real)} photographs, {len(generated)} generated, {len(held_out)} to check")
     check = collate([example(sample, None) for sample in held_out])
     loader = iter(
         torch.utils.data.DataLoader(
             Stream(real, generated, arguments.share, arguments.seed), arguments.batch,
-            collate_fn=collate, num_workers=1, prefetch_factor=6,
+            collate_fn=collate, num_workers=arguments.workers, prefetch_factor=6,
+            pin_memory=device.type == "cuda",
         )
     )  # fmt: skip
-    net = Reader().to(memory_format=torch.channels_last)
+    check = {name: part.to(device) for name, part in check.items()}
+    net = Reader().to(device, memory_format=torch.channels_last)
     print(f"{sum(p.numel() for p in net.parameters()) / 1e6:.2f} million weights", flush=True)
     if arguments.start:
-        net.load_state_dict(torch.load(arguments.start, weights_only=True))
+        net.load_state_dict(torch.load(arguments.start, map_location=device, weights_only=True))
     average = copy.deepcopy(net).eval()
     optimiser = torch.optim.AdamW(net.parameters(), arguments.rate, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -222,9 +251,9 @@ def main() -> None:
     )
     started, told = time.time(), {}
     for step in range(1, arguments.steps + 1):
-        batch = next(loader)
-        image = batch["image"].contiguous(memory_format=torch.channels_last)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        batch = {name: part.to(device, non_blocking=True) for name, part in next(loader).items()}
+        image = batch["image"].float().contiguous(memory_format=torch.channels_last)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
             answer, kind = net(image)
         parts = losses(answer.float(), kind.float(), batch)
         total = sum(parts.values())
@@ -240,8 +269,9 @@ def main() -> None:
                 mean.lerp_(now, 1 - decay)
             else:
                 mean.copy_(now)
-        for name, part in parts.items():
-            told[name] = 0.98 * told.get(name, part.item()) + 0.02 * part.item()
+        if step % TOLD == 0:
+            for name, part in parts.items():
+                told[name] = 0.9 * told.get(name, part.item()) + 0.1 * part.item()
         if step % 500 == 0 or step == arguments.steps or step == 20:
             shown = " ".join(f"{name} {value:.3f}" for name, value in told.items())
             print(
