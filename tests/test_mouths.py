@@ -229,3 +229,21 @@ def test_command_line_writes_pictures_labels_and_index(mouths: ModuleType, tmp_p
         assert isinstance(entry["primary"], bool)
     for file in (tmp_path / "a").iterdir():
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+
+
+def test_whose_mouth_it_is_chooses_some_options(mouths: ModuleType) -> None:
+    batch = importlib.import_module(f"{mouths.__name__}.batch")
+    made = {
+        whose: [batch.options_of(whose, np.random.default_rng(k)) for k in range(60)]
+        for whose in batch.PATIENTS
+    }
+    assert not any(made["anybody"])
+    assert {options["dentition"] for options in made["children"]} == {"primary", "mixed"}
+    braces = [options["braces_upper"] for options in made["orthodontic"]]
+    assert 0.5 < np.mean(braces) < 0.9
+    for options in made["orthodontic"]:
+        assert (
+            options["dentition"] == "permanent"
+            and options["braces_upper"] >= (options["braces_lower"])
+        )
+        mouths.options.random_options(np.random.default_rng(0), **options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from augment import example, frame  # noqa: E402
+from brackets import draw_braces  # noqa: E402
 from export import to_onnx  # noqa: E402
 from network import CHANNELS, HEIGHT, JAW, SHAPES, VIEWS, WIDTH, Reader  # noqa: E402
 from samples import MIRRORED, UNNUMBERED, Sample, distance_inside  # noqa: E402
@@ -132,3 +134,64 @@ def test_opencv_runs_what_torch_learned(tmp_path: Path) -> None:
     )
     assert np.abs(maps - answer.numpy()).max() < 0.02 * np.abs(answer.numpy()).max()
     assert np.abs(views - kind.numpy()).max() < 0.02 * max(1, np.abs(kind.numpy()).max())
+
+
+def test_braces_are_drawn_onto_crowns_and_labels_stay() -> None:
+    made = whole_row()
+    plain = made.image.copy()
+    image = plain.copy()
+    draw_braces(image, made, np.array([[1.0, 0, 0], [0, 1.0, 0]]), np.random.default_rng(3))
+    changed = (image != plain).any(axis=2)
+    assert 0.05 < changed[made.crowns > 0].mean() < 0.9
+    # Wires pass between crowns, and hooks end there; nothing is drawn above and below the rows.
+    assert not changed[:10].any() and not changed[-10:].any()
+    assert (made.crowns == whole_row().crowns).all() and (made.teeth == whole_row().teeth).all()
+
+
+def test_no_braces_on_photographs_from_above_or_below() -> None:
+    made = replace(whole_row(), view=VIEWS.index("upper"))
+    image = made.image.copy()
+    draw_braces(image, made, np.array([[1.0, 0, 0], [0, 1.0, 0]]), np.random.default_rng(3))
+    assert (image == made.image).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_nobody_outlined_is_left_out_wherever_it_goes(seed: int) -> None:
+    plain = sample()
+    plain.image[20:60, 120:150] = (250, 30, 30)  # a red tooth without an outline
+    told = np.ones_like(plain.told)
+    told[20:60, 120:150] = 0
+    found, whole = (
+        example(s, np.random.default_rng(seed)) for s in (replace(plain, told=told), plain)
+    )
+    left_out = (whole.valid == 1) & (found.valid == 0)
+    assert (found.image == whole.image).all() and (found.valid <= whole.valid).all()
+    if left_out.any():
+        red = (found.image[0] - found.image[1])[::2, ::2]
+        assert red[left_out].mean() > 5 * abs(red[found.valid == 1].mean())
+
+
+def test_what_is_left_out_counts_in_no_loss_of_outlines() -> None:
+    torch.manual_seed(0)
+    net = Reader((8, 8, 16, 16, 16)).eval()
+    told = np.ones_like(sample().told)
+    told[20:60, 120:150] = 0
+    batch = collate([example(replace(sample(), told=told), None)])
+    answer, kind = net(batch["image"].float())
+    other = answer.clone()
+    other[:, :SHAPES] += 3 * (batch["valid"] == 0)[:, None] * (batch["number"] == 0)[:, None]
+    parts = [losses(a, kind, batch) for a in (answer, other)]
+    for name in ("tooth", "inside", "border"):
+        assert torch.isclose(parts[0][name], parts[1][name]), name
+
+
+def whole_row() -> Sample:
+    """Six crowns above six, wide enough for brackets."""
+    teeth = np.zeros((120, 200), np.uint8)
+    for k in range(6):
+        x = 10 + 30 * k
+        teeth[15:57, x : x + 28] = (13, 12, 11, 21, 22, 23)[k]
+        teeth[62:104, x : x + 28] = (43, 42, 41, 31, 32, 33)[k]
+    image = np.full((120, 200, 3), 200, np.uint8)
+    inside = distance_inside(teeth)
+    return Sample("made", image, teeth, teeth, inside, np.ones_like(teeth), 0, 0)
