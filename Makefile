@@ -59,9 +59,9 @@ soak: .venv/installed-dev
 	$(BIN)/python tests/soak/fuzz_numbers.py --seed $(SEED) --count $(INPUTS) --quiet
 	$(BIN)/python tests/soak/kill_resume.py --seed $(SEED) --count $(KILLS)
 
-# The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: ten
-# minutes on a card (DEVICE=cuda WORKERS=15), half a day on two cores. START=FILE goes on from weights
-# that an earlier training wrote (1600 steps at RATE=0.002 then do).
+# The tooth reader's weights again, from the labelled photographs in DATA and generated mouths: half an
+# hour for the mouths on two cores, then ten minutes on a card (DEVICE=cuda WORKERS=15) or fifteen hours
+# without. START=FILE goes on from weights of an earlier training (STEPS=1600 RATE=0.002 then do).
 reader: .venv/installed-dev
 	@test -d "$(DATA)" || { echo "make reader DATA=FOLDER: a folder with train/, valid/, fdi.json"; exit 2; }
 	for sort in "anybody 1 900" "orthodontic 2 500" "children 3 350"; do \

@@ -155,20 +155,23 @@ def test_no_braces_on_photographs_from_above_or_below() -> None:
     assert (image == made.image).all()
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_what_nobody_outlined_is_left_out_wherever_it_goes(seed: int) -> None:
+def test_what_nobody_outlined_is_left_out_wherever_it_goes() -> None:
     plain = sample()
     plain.image[20:60, 120:150] = (250, 30, 30)  # a red tooth without an outline
     told = np.ones_like(plain.told)
     told[20:60, 120:150] = 0
-    found, whole = (
-        example(s, np.random.default_rng(seed)) for s in (replace(plain, told=told), plain)
-    )
-    left_out = (whole.valid == 1) & (found.valid == 0)
-    assert (found.image == whole.image).all() and (found.valid <= whole.valid).all()
-    if left_out.any():
+    seen = 0
+    for seed in range(12):
+        found, whole = (
+            example(s, np.random.default_rng(seed)) for s in (replace(plain, told=told), plain)
+        )
+        left_out = (whole.valid == 1) & (found.valid == 0)
+        assert (found.image == whole.image).all() and (found.valid <= whole.valid).all()
         red = (found.image[0] - found.image[1])[::2, ::2]
-        assert red[left_out].mean() > 5 * abs(red[found.valid == 1].mean())
+        if left_out.any():
+            seen += 1
+            assert red[left_out].mean() > 5 * abs(red[found.valid == 1].mean())
+    assert seen > 6
 
 
 def test_what_is_left_out_counts_in_no_loss_of_outlines() -> None:

@@ -37,7 +37,7 @@ _UPRIGHT, _MORE_UPRIGHT, _LEAST_IN_ROW = 2.8, 0.5, 3
 #: Logit of the jaw that counts as much in that as certainty about a tooth's place.
 _JAW_UNIT = 5.0
 #: Numbers less probable than this are not kept.
-_LEAST_SHARE = 1e-5
+_LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,13 @@ class _Place:
 
     middle: Array
     along: Array
-    upward: Array
+    downward: Array
 
     def corners(self, x: float, y: float, w: float, h: float) -> npt.NDArray[np.int32]:
         """A box around (x, y) with half sizes (w, h), all in halves of the bracket."""
         signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
         points = np.array([x, y]) + signs * [w, h]
-        return np.int32(np.round(self.middle + points @ np.stack([self.along, self.upward])))
+        return np.int32(np.round(self.middle + points @ np.stack([self.along, self.downward])))
 
 
 @dataclass(frozen=True)
@@ -101,16 +101,16 @@ def _places(row: list, transform: Array, size: float, rng: np.random.Generator) 
         along = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         lean = np.radians(rng.normal(0, 6))
         along = np.array([np.cos(lean), np.sin(lean)]) @ np.array([along, [-along[1], along[0]]])
-        upward = np.array([-along[1], along[0]])
+        downward = np.array([-along[1], along[0]])
         at = (pixels - pixels.mean(0)) @ turn.T
         # A box's side is 3.5 times its deviation.
-        wide, tall = (1.73 * float(np.std(at @ axis)) for axis in (along, upward))
+        wide, tall = (1.73 * float(np.std(at @ axis)) for axis in (along, downward))
         middle = (
-            centres[k] + upward * tall * rng.normal(0, 0.12) + along * wide * rng.normal(0, 0.1)
+            centres[k] + downward * tall * rng.normal(0, 0.12) + along * wide * rng.normal(0, 0.1)
         )
         wide *= size * rng.uniform(0.9, 1.1)
         tall = min(tall * size * rng.uniform(0.85, 1.1), 1.6 * wide + 2)
-        places.append(_Place(middle, wide * along, tall * upward))
+        places.append(_Place(middle, wide * along, tall * downward))
     return [place for place in places if rng.random() > 0.06]
 
 

@@ -120,6 +120,8 @@ def read_labelled(
         told = None
         if unlabelled is not None:
             hidden = cv2.imread(str(unlabelled / path.name), cv2.IMREAD_GRAYSCALE)
+            if hidden is None:
+                raise FileNotFoundError(f"{unlabelled} lacks {path.name}: run unlabelled.py again")
             told = (hidden == 0).astype(np.uint8)
         return _sample(
             f"{split}/{path.stem}", np.ascontiguousarray(image[..., ::-1]), crowns,

@@ -59,7 +59,7 @@ def how_often(sample: Sample) -> float:
     """How often a labelled photograph is drawn."""
     teeth = sample.teeth[sample.teeth > 0]
     numbered = teeth != UNNUMBERED
-    if numbered.mean() <= 0.5:
+    if numbered.sum() <= numbered.size / 2:
         return 1.0
     weight = NUMBERED_SIDE if sample.view in SIDES else NUMBERED
     return weight * (WITH_PRIMARY if (teeth[numbered] > 50).any() else 1.0)

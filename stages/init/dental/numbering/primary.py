@@ -37,8 +37,8 @@ LATE_MOLAR_COST, EARLY_MOLAR_COST = 8.0, 3.0
 #: seen far fewer primary teeth than there are among children. Means over the crowns of a patient
 #: are -4.3 to -1.4 in four children, -11.1 to -8.6 in eight adults.
 EVEN_ODDS = -7.0
-#: Less probable than this is as good as not at all: well below even odds.
-LEAST_PROBABILITY = 1e-5
+#: Less probable than this is as good as not at all: it already counts `MOST_ODDS` by even odds.
+LEAST_PROBABILITY = 1e-4
 #: Odds of one crown count no more than this.
 MOST_ODDS = 2.0
 #: Mean log odds this much below even still ask for a look at a child's arch.
