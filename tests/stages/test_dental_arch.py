@@ -32,6 +32,7 @@ from tests.stages.dental_patient import (
     rotation_errors,
     three,
 )
+from tests.stages.mouth_case import looks_like
 
 #: Fewer rivals are tried than for a patient; with all 40 the numbers of these mouths are the same.
 QUICK = ArchOptions(rows_tried=8)
@@ -230,6 +231,26 @@ def test_missing_tooth_leaves_the_other_numbers_right() -> None:
     for view, upper in zip(result.views, expected, strict=True):
         assert all(found in (0, true) for found, true in zip(view.upper, upper, strict=True))
         assert view.upper.count(0) <= 1
+
+
+def test_premolars_whose_space_has_closed_are_found_missing() -> None:
+    """Molars stand where premolars would, and may look like them."""
+    gone = (15, 25)
+    kept: list[Dentition | None] = []
+    expected = []
+    shift = textbook_arch(frozenset(gone)) - textbook_arch()
+    shots = [photograph(patient(4) + shift, yaw, seed=k) for k, yaw in enumerate((-42.0, 0, 42.0))]
+    for dentition, _, (upper, _) in shots:
+        row = [
+            replace(crown, numbers=looks_like(tooth - 1 if tooth % 10 == 6 else tooth, 0.5))
+            for crown, tooth in zip(dentition.upper, upper, strict=True)
+            if tooth not in gone
+        ]
+        kept.append(replace(dentition, upper=tuple(row)))
+        expected.append(tuple(tooth for tooth in upper if tooth not in gone))
+    result = fit(kept, QUICK)
+    for view, upper in zip(result.views, expected, strict=True):
+        assert view.upper == upper
 
 
 def test_what_is_wrong_without_looks_is_marked() -> None:

@@ -9,7 +9,7 @@ from itertools import combinations, pairwise, product
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import JAWS
+from pipeline.artifacts.dental.fdi import JAWS, teeth_of
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
@@ -23,7 +23,7 @@ from stages.init.dental.numbering.hypotheses import (
     ViewLabels,
     contiguous,
 )
-from stages.init.dental.template import POSITIONS, tooth_at
+from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
 Array = npt.NDArray[np.float64]
 Fixed = dict[tuple[int, int, int], int]
@@ -117,50 +117,65 @@ def _allowed(view: int, jaw: int, labels: Labels, fixed: Fixed) -> bool:
 
 
 def with_row(labelling: Labelling, number: int, jaw: int, labels: Labels) -> Labelling:
-    """A labelling with one row replaced; `number` counts its views."""
+    """A labelling with one row replaced, and no tooth missing that this row shows.
+
+    Args:
+        number: counts the labelling's views.
+    """
     rows: ViewLabels = (
         (labels, labelling.labels[number][1]) if jaw == 0 else (labelling.labels[number][0], labels)
     )
     changed = (*labelling.labels[:number], rows, *labelling.labels[number + 1 :])
-    return replace(labelling, labels=changed)
+    there = {t for t in labelling.absent if t in teeth_of(JAWS[jaw]) and position_of(t) in labels}
+    return replace(
+        labelling, labels=changed, absent=labelling.absent - there, closed=labelling.closed - there
+    )
 
 
 def missing_tooth_edits(labelling: Labelling, adjusted: Adjusted) -> list[Labelling]:
     """A tooth missing in the patient, its space open or closed; or one called missing that is not.
 
-    The numbers beyond the gap move outward in every photograph; or, in the one taken most from its
-    side, the numbers before it move inward.
+    The numbers beyond it move outward in every photograph, all of them or as far as the next gap of
+    the row; or, in the photograph taken most from its side, the numbers before it move inward.
     """
     edits: list[Labelling] = []
     for jaw, name in enumerate(JAWS):
+        rows = [both[jaw] for both in labelling.labels]
         for position in range(POSITIONS):
             tooth = tooth_at(name, position)
-            if tooth in labelling.absent:
-                continue
-            inside = [
-                number for number, labels in enumerate(labelling.labels) if position in labels[jaw]
-            ]
-            if not inside:
+            inside = [number for number, row in enumerate(rows) if position in row]
+            if tooth in labelling.absent or not inside:
                 continue
             outward = -1 if position < POSITIONS // 2 else 1
+            everywhere = [_renamed(row, position, outward) for row in rows]
             # The photograph taken most from this tooth's side: there the back teeth may have held.
             yaws = view_angles(adjusted)[:, 0] * outward
             sideways = max(inside, key=lambda number: (float(yaws[number]), number))
-            for inward_view in (-1, sideways):
+            held = list(everywhere)
+            held[sideways] = _renamed(rows[sideways], position, -outward)
+            to_gaps = [_renamed(row, position, outward, to_gap=True) for row in rows]
+            for renamed in (everywhere, held, *[to_gaps] * (to_gaps != everywhere)):
                 changed = labelling
-                for number, labels in enumerate(labelling.labels):
-                    row = labels[jaw]
-                    if number == inward_view:
-                        chosen = [(label - position) * outward <= 0 for label in row]
-                        new = _bounded(_shifted(row, chosen, -outward))
-                    else:
-                        chosen = [(label - position) * outward >= 0 for label in row]
-                        new = _bounded(_shifted(row, chosen, outward))
-                    changed = with_row(changed, number, jaw, new)
-                absent = labelling.absent | {tooth}
-                edits.append(replace(changed, absent=absent))
-                edits.append(replace(changed, absent=absent, closed=labelling.closed | {tooth}))
+                for number, row in enumerate(renamed):
+                    changed = with_row(changed, number, jaw, row)
+                changed = replace(changed, absent=changed.absent | {tooth})
+                edits += [changed, replace(changed, closed=changed.closed | {tooth})]
     return edits
+
+
+def _renamed(row: Labels, position: int, by: int, to_gap: bool = False) -> Labels:
+    """A row whose labels from a position on, in the direction of `by`, are moved by it.
+
+    Args:
+        to_gap: no further than the row's next gap, which closes.
+    """
+    end = position
+    while to_gap and end in row:
+        end += by
+    chosen = [
+        (label - position) * by >= 0 and (not to_gap or (end - label) * by > 0) for label in row
+    ]
+    return _bounded(_shifted(row, chosen, by))
 
 
 def without_view(scorer: Scorer, scored: Scored, number: int) -> Scored:
