@@ -18,8 +18,8 @@ from stages.init.dental.template import position_of
 OPTIONS = ArchOptions()
 
 
-def cost(*teeth: int, primary: tuple[int, ...] = ()) -> float:
-    return OPTIONS.cost_of_missing(frozenset(teeth), frozenset(primary))
+def cost(*teeth: int) -> float:
+    return OPTIONS.cost_of_missing(frozenset(teeth))
 
 
 def labelling(*views: tuple[int, ...]) -> Labelling:
@@ -47,7 +47,11 @@ def test_premolars_are_missing_more_often_and_in_pairs() -> None:
     assert cost(15) < cost(15, 25) < 1.5 * cost(15), "the other side's comes along"
     assert cost(15, 35) == 2 * cost(15), "another jaw's does not"
     assert cost(16, 26) == 2 * cost(16), "nor do molars"
-    assert cost(15, primary=(14, 15)) == cost(16), "primary molars are not taken out for room"
+    child = OPTIONS.of_a_child()
+    for teeth in ({15}, {14, 24}, {12, 15, 25}):
+        assert child.cost_of_missing(frozenset(teeth)) == len(teeth) * cost(16), (
+            "primary molars stay"
+        )
 
 
 def test_a_missing_tooth_takes_up_the_gap_behind_it() -> None:

@@ -125,6 +125,9 @@ def fit_arch(
         doubts.append("fewer than two photographs show teeth well enough")
         return ArchFit((None,) * len(dentitions), {}, {}, 0.0, tuple(doubts))
     read = [dentition for dentition in (dentitions[i] for i in placeable) if dentition is not None]
+    perhaps_a_child = perhaps_primary(read)
+    if perhaps_a_child:
+        options = options.of_a_child()
     inner = replace(
         options,
         order=None if options.order is None else tuple(options.order[i] for i in placeable),
@@ -147,7 +150,7 @@ def fit_arch(
     elif len(placeable) == 3:
         doubts += role_doubts(best)
     cost, primary = primary_teeth(scorer, best, read)
-    if perhaps_primary(read):
+    if perhaps_a_child:
         # A child's arch may tell another numbering than an adult's.
         childs = [(as_a_childs(upper), as_a_childs(lower)) for upper, lower in rows]
         child = Scorer(childs, focal, deviation, scorer.options, threads, held, ALL_PRIMARY)

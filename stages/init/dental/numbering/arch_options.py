@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.artifacts.dental.fdi import is_left, other_side
 
@@ -107,19 +107,22 @@ class ArchOptions:
     #: a share of the band.
     max_epipolar_error: float = 0.036
 
-    def cost_of_missing(self, absent: frozenset[int], primary: frozenset[int]) -> float:
-        """What it costs to call teeth missing in the patient.
-
-        Args:
-            absent: FDI numbers of them (11-47).
-            primary: those in whose place primary teeth stand: primary molars keep the space.
-        """
-        costs = {4: self.missing_first_premolar_cost, 5: self.missing_second_premolar_cost}
+    def cost_of_missing(self, absent: frozenset[int]) -> float:
+        """What it costs to call these teeth (FDI numbers) missing in the patient."""
+        premolars = {4: self.missing_first_premolar_cost, 5: self.missing_second_premolar_cost}
         total = 0.0
         for tooth in sorted(absent):
-            premolar = tooth % 10 in costs and tooth not in primary
-            if premolar and is_left(tooth) and other_side(tooth) in absent:
-                total += self.missing_pair_cost
-            else:
-                total += costs[tooth % 10] if premolar else self.missing_cost
+            cost = premolars.get(tooth % 10, self.missing_cost)
+            second = tooth % 10 in premolars and is_left(tooth) and other_side(tooth) in absent
+            total += self.missing_pair_cost if second else cost
         return total
+
+    def of_a_child(self) -> ArchOptions:
+        """The same where primary teeth may stand. A second primary molar looks like a first
+        permanent one, which it would be called if the premolar in its own place were easily
+        missing."""
+        cost = self.missing_cost
+        return replace(
+            self, missing_first_premolar_cost=cost, missing_second_premolar_cost=cost,
+            missing_pair_cost=cost,
+        )  # fmt: skip

@@ -204,8 +204,7 @@ class Scorer:
     def costs(self, labelling: Labelling) -> float:
         """What a labelling costs before it is solved."""
         options = self.options
-        total = options.cost_of_missing(labelling.absent, labelling.primary)
-        total += self.looks(labelling)
+        total = options.cost_of_missing(labelling.absent) + self.looks(labelling)
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
             total += self.row_costs(view, labels, labelling.absent)
         if len(self.rows) == 3 and options.order is None:
