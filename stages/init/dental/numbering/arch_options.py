@@ -44,7 +44,7 @@ class ArchOptions:
     landmark_deviation: float = 1.2
     #: What a landmark that a labelling leaves unused costs (twice the log likelihood).
     unused_cost: float = 8.0
-    #: What it costs to call a tooth missing in all photographs, or a crown merged, split or none.
+    #: What it costs to call a tooth missing in all photographs.
     missing_cost: float = 20.0
     #: Premolars, taken out for a treatment or never there, are missing more often: twice the
     #: negative log odds of 5 first ones of 262 and 11 second ones of 143 (twelve patients and 110
@@ -53,6 +53,7 @@ class ArchOptions:
     missing_first_premolar_cost: float = 8.0
     missing_second_premolar_cost: float = 5.0
     missing_pair_cost: float = 2.0
+    #: What it costs to call a crown merged, split or none.
     defect_cost: float = 12.0
     #: What it costs that a tooth is hidden before the last crown of a row: from .5 to 3 as many
     #: numbers of twelve patients come out right.
