@@ -49,7 +49,8 @@ class ArchOptions:
     #: Premolars, taken out for a treatment or never there, are missing more often: twice the
     #: negative log odds of 5 first ones of 262 and 11 second ones of 143 (twelve patients and 110
     #: labelled photographs that show a tooth behind). And mostly on both sides: what the second
-    #: of two costs. Molars at their rates (first ones 2 of 55) are called missing where they are not.
+    #: of two costs. Molars at their rates (first ones 2 of 55) are called missing where they are
+    #: not.
     missing_first_premolar_cost: float = 8.0
     missing_second_premolar_cost: float = 5.0
     missing_pair_cost: float = 2.0
