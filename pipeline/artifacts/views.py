@@ -30,6 +30,8 @@ class View:
         source_sha256: of the source file's bytes.
         focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
         timestamp: seconds from the start of the video, or None.
+        taken_after: by the cameras' clocks, seconds after the first photograph of the case was
+            taken, or None. (When that was is nobody's business, and not kept.)
         lens_taken_out: where the image has been undistorted, the lens that it had before, as a line
             of COLMAP's ``cameras.txt`` without number (model, width, height, parameters);
             `working_from_source` then leads to pixels of the image before.
@@ -44,6 +46,7 @@ class View:
     source_sha256: str = ""
     focal_px: float | None = None
     timestamp: float | None = None
+    taken_after: float | None = None
     lens_taken_out: str = ""
 
     @property
@@ -128,6 +131,7 @@ class Views(Artifact):
                     "source_size": list(view.source_size),
                     "focal_px": view.focal_px,
                     "timestamp": view.timestamp,
+                    "taken_after": view.taken_after,
                     "lens_taken_out": view.lens_taken_out,
                 }
             )
@@ -153,6 +157,7 @@ class Views(Artifact):
                     source_sha256=entry["source_sha256"],
                     focal_px=entry["focal_px"],
                     timestamp=entry["timestamp"],
+                    taken_after=entry.get("taken_after"),
                     lens_taken_out=entry.get("lens_taken_out", ""),
                 )
             )

@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import Views, to_uint8
-from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, there_and_back
+from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, there_and_back, widened
 from stages.export.pictures.video import even
 from stages.export.splats import opacities
 from stages.splatting.frame import move_cameras, move_gaussians, move_points
@@ -57,11 +57,19 @@ class Scene:
         return to_uint8(self.render(camera).image)
 
     def path(self, seconds: float, fps: int, sway_degrees: float) -> tuple[list[Camera], list[int]]:
-        """Places of the video, at the (even) size of the middle photograph, and each frame's."""
+        """Places of the video, at the (even) size of the middle photograph, and each frame's.
+
+        What is cut out by masks is in the picture as a whole; other scenes go on beyond it.
+        """
         middle = self.cameras[self.orbit.middle()]
         size = (even(middle.width), even(middle.height))
         count = max(1, round(seconds * fps))
-        return there_and_back(self.orbit, self.cameras, size, count, np.radians(sway_degrees))
+        sway = np.radians(sway_degrees)
+        places, frames = there_and_back(self.orbit, self.cameras, size, count, sway)
+        if self.masked:
+            solid = centres(self.gaussians)
+            places = widened(places, solid.positions.astype(np.float64))
+        return places, frames
 
     def novel_camera(self) -> Camera:
         """A viewpoint between photographs, above or below: as far from all as one gets."""

@@ -30,12 +30,14 @@ class Loaded:
         source_sha256: of the file.
         picture: what it looks like.
         timestamp: seconds from the first frame of the video, or None.
+        taken_at: by the camera's clock, seconds; or None.
     """
 
     source_name: str
     source_sha256: str
     picture: Prepared
     timestamp: float | None = None
+    taken_at: float | None = None
 
 
 def load_photos(
@@ -66,7 +68,8 @@ def load_photos(
             )
         except UnusableFile as error:
             return f"{label} {error}"
-        return Loaded(label, hashlib.sha256(data).hexdigest(), picture)
+        digest = hashlib.sha256(data).hexdigest()
+        return Loaded(label, digest, picture, taken_at=photo.taken_at)
 
     loaded, problems = [], []
     with Decoder() as decoder, ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
@@ -141,6 +144,7 @@ def drop_duplicates(
 
 def prepared_views(loaded: Sequence[Loaded], prefix: str = "") -> tuple[View, ...]:
     """The views of an artifact, numbered in order: ``000``, ``001``, ... after the prefix."""
+    times = [item.taken_at for item in loaded if item.taken_at is not None]
     return tuple(
         View(
             name=f"{prefix}{number:03d}",
@@ -152,6 +156,7 @@ def prepared_views(loaded: Sequence[Loaded], prefix: str = "") -> tuple[View, ..
             source_sha256=item.source_sha256,
             focal_px=item.picture.focal_px,
             timestamp=item.timestamp,
+            taken_after=None if item.taken_at is None else item.taken_at - min(times),
         )
         for number, item in enumerate(loaded)
     )

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.artifacts.views import View, Views
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
 from stages.init.dental.numbering.confidence import Evidence, same_mouth
 from stages.init.dental.numbering.rivals import Margins
+from stages.init.dental.place import of_several_days, one_sitting
 
 ENAMEL, GUM = (0.62, 0.55, 0.42), (0.38, 0.16, 0.15)  # linear light
 
@@ -80,3 +82,33 @@ def test_what_colours_no_longer_say_the_rest_must_make_good(
     assert (found.sureness >= 0) == same
     assert found.odd == 2 or one_light == 1.0
     assert found.sureness == max(found.one_light, found.any_light)
+
+
+def test_the_cameras_clock_speaks_for_one_mouth_or_against_it() -> None:
+    seen = evidence(5.0, 1.0, 40.0, 0.01)
+    unknown, one, several = (
+        same_mouth(seen, ArchOptions(one_sitting=said)).sureness for said in (None, True, False)
+    )
+    assert several < unknown < one
+    assert one - unknown == pytest.approx(unknown - several)
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ((0.0, 60.0, 90.0), True),
+        ((0.0, None, 90.0), None),
+        ((0.0, 60.0, 7200.0), None),
+        ((86400.0 * 12, 60.0, 0.0), False),
+    ],
+)
+def test_a_sitting_is_some_minutes_and_days_are_several(
+    times: tuple[float | None, ...], said: bool | None
+) -> None:
+    views = Views(
+        tuple(View(f"{k:03d}", np.zeros((4, 4, 3)), taken_after=t) for k, t in enumerate(times))
+    )
+    assert one_sitting(views) is said
+    warned = of_several_days(views, ["a.jpg", "b.jpg", "c.jpg"])
+    assert len(warned) == (said is False)
+    assert said is not False or "a.jpg was taken 12 days after c.jpg" in warned[0]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.init.dental.surface.chart.jaws import _scraps
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.ends import _with_hidden_fronts
 from stages.init.dental.surface.options import SurfaceOptions
@@ -109,3 +110,14 @@ def test_what_all_photographs_see_at_a_low_angle_has_no_depth(only_clear: bool) 
     assert away.sum() > 50
     assert shown[towards].mean() > 0.95
     assert shown[away].mean() < 0.15 if only_clear else shown[away].mean() > 0.5
+
+
+def test_a_scrap_smaller_than_a_tooth_and_its_gum_is_none_of_the_surface() -> None:
+    """The largest piece stays, however small, and so does another with room for a tooth."""
+    row, tooth, scrap = (np.zeros((60, 400), bool) for _ in range(3))
+    row[10:50, 10:200] = True
+    tooth[10:50, 250:280] = True  # 20 x 15 mm at two samples per mm
+    scrap[10:30, 300:316] = True  # 10 x 8 mm
+    np.testing.assert_array_equal(_scraps(row | tooth | scrap, 2.0), scrap)
+    assert not _scraps(scrap, 2.0).any()
+    assert not _scraps(np.zeros_like(row), 2.0).any()

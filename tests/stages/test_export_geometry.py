@@ -11,6 +11,7 @@ from stages.export.pictures.orbits import (
     find_orbit,
     look_at,
     there_and_back,
+    widened,
 )
 from stages.splatting.frame import (
     harmonics,
@@ -123,6 +124,25 @@ def test_the_path_passes_through_the_cameras_and_loops_smoothly() -> None:
     steps = np.linalg.norm(np.diff(eyes, axis=0, append=eyes[:1]), axis=1)
     assert steps.max() < 2.5 * np.median(steps)
     assert all((camera.width, camera.height) == (64, 48) for camera in path)
+
+
+def test_widened_cameras_hold_what_reached_beyond_the_picture() -> None:
+    cameras = scene.ball_cameras()
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * [1.6, 0.4, 0.4]
+    reach = [np.abs(c.project(points)[0] - (c.cx, c.cy)) / (c.width / 2) for c in cameras]
+    assert max(r[:, 0].max() for r in reach) > 1, "else nothing would be tested"
+    wide = widened(cameras, points)
+    for camera, before in zip(wide, cameras, strict=True):
+        pixels, _ = camera.project(points)
+        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        assert inside.mean() > 0.999
+        np.testing.assert_array_equal(camera.cam_from_world, before.cam_from_world)
+        assert camera.fx / before.fx == pytest.approx(wide[0].fx / cameras[0].fx)
+
+
+def test_cameras_that_hold_everything_stay_as_they_are() -> None:
+    cameras = list(scene.ball_cameras())
+    assert widened(cameras, np.zeros((4, 3)) + cameras[0].rotation[0] * 0.01) == cameras
 
 
 def test_a_path_through_many_shaky_cameras_is_smooth() -> None:

@@ -124,6 +124,15 @@ def test_the_focal_length_where_it_is_said() -> None:
     assert decode_dicom(as_bytes(dicom_photograph(RGB))).focal_px is None
 
 
+def test_when_it_was_taken_where_that_is_said() -> None:
+    first, second, nonsense = (
+        decode_dicom(as_bytes(dicom_photograph(RGB, AcquisitionDateTime=text))).taken_at
+        for text in ("20261127140559.123+0100", "20261127140701", "2026")
+    )
+    assert first is not None and second is not None
+    assert second - first == 62 and nonsense is None
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

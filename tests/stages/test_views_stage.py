@@ -121,6 +121,18 @@ def test_mixed_sizes_exif_and_masks(tmp_path: Path) -> None:
     np.testing.assert_allclose(a.working_from_source @ (0.5, 0.5, 1), (89.75, 0.25, 1))
 
 
+def test_times_are_told_from_the_first_photograph_on(tmp_path: Path) -> None:
+    """The date itself is private."""
+    times = ("2019:07:04 08:16:30", "2019:07:04 08:15:00", "nonsense")
+    for n, time in enumerate(times):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = time
+        write(tmp_path / "in" / f"{n}.jpg", picture(n), exif=exif)
+    views, _, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
+    assert [view.taken_after for view in views.views] == [90, 0, None]
+    assert b"2019" not in b"".join(artifact_bytes(tmp_path / "out" / "views").values())
+
+
 def test_duplicates_are_left_out_with_a_warning(tmp_path: Path) -> None:
     write(tmp_path / "in" / "a.png", picture(1))
     write(tmp_path / "in" / "b.bmp", picture(1))

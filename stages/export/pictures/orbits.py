@@ -19,6 +19,8 @@ MOST_KNOTS = 7
 KNOT_SPACING = np.radians(2.0)
 #: A path is at least this wide, even if all photographs were taken from one spot.
 LEAST_SPAN = np.radians(12.0)
+#: A picture that is to hold a scene may leave out so much of it, and has so much around it.
+_OUTSIDE, _MARGIN = 0.0005, 0.03
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,30 @@ def there_and_back(
     azimuths = np.asarray((low + high) / 2 + (high - low) / 2 * places, np.float64)
     poses = path_poses(orbit, azimuths, np.asarray(sway * np.sin(np.pi * places), np.float64))
     return _cameras(poses, lens(cameras, *size)), place_of_frame.tolist()
+
+
+def widened(cameras: Sequence[Camera], points: Array) -> list[Camera]:
+    """The cameras with a field of view as wide, all the same, as it takes to see the points.
+
+    Photographs of a mouth rarely hold all of it: on a path along their places, parts would leave
+    the picture and come back.
+
+    Args:
+        cameras: whose pictures are of one size, with the middle of the picture on the axis.
+        points: [N, 3]; a few of them may stay outside.
+
+    Returns:
+        Cameras with the focal lengths as they were, or shorter.
+    """
+    reach = 1e-6
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        away = np.abs(pixels - (camera.cx, camera.cy)) / (camera.width / 2, camera.height / 2)
+        ahead = away.max(axis=1)[depth > 0]
+        if len(ahead):
+            reach = max(reach, float(np.quantile(ahead, 1 - _OUTSIDE)))
+    zoom = min(1.0, (1 - _MARGIN) / reach)
+    return [replace(camera, fx=zoom * camera.fx, fy=zoom * camera.fy) for camera in cameras]
 
 
 def between(orbit: Orbit, cameras: Sequence[Camera], count: int) -> list[Camera]:

@@ -33,6 +33,11 @@ from stages.init.write import save_all
 
 Map = npt.NDArray[np.float32]
 
+#: Photographs of a sitting are taken within so many seconds: a patient's mostly within two minutes,
+#: and the next one has sat down after ten.
+_SITTING = 600.0
+_DAY = 86400.0
+
 
 def from_teeth(context: StageContext, views: Views) -> None:
     """Place the views by their teeth, and write what came out.
@@ -65,6 +70,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
     for doubt in (
         *teeth.fit.doubts, *in_another_light(names, teeth), *turned_back(names, teeth),
         *misnamed(names, teeth), *numbered_otherwise(teeth, config.dental.min_margin),
+        *of_several_days(views, names),
     ):  # fmt: skip
         context.warn(doubt)
     numbered = updated(read, [d for d in teeth.dentitions if d is not None])
@@ -117,6 +123,32 @@ def numbered_otherwise(teeth: Reconstruction, min_margin: float) -> list[str]:
         f"{min_margin:.0f}). It renames teeth that one photograph alone shows, such as those "
         "behind a tooth that may be missing: the scene does not rest on it, their numbers are "
         "marked. Check them on the page check.html."
+    ]
+
+
+def one_sitting(views: Views) -> bool | None:
+    """Were all photographs taken within minutes, or on several days, by the camera's clock?
+
+    None where it says neither: photographs lose their times when they are sent or edited.
+    """
+    times = [view.taken_after for view in views.views]
+    if len(times) < 2 or None in times:
+        return None
+    between = max(t for t in times if t is not None) - min(t for t in times if t is not None)
+    return True if between <= _SITTING else False if between >= _DAY else None
+
+
+def of_several_days(views: Views, names: list[str]) -> list[str]:
+    """What to say of photographs that were taken on several days."""
+    if one_sitting(views) is not False:
+        return []
+    times = [view.taken_after or 0.0 for view in views.views]
+    first, last = int(np.argmin(times)), int(np.argmax(times))
+    days = round((times[last] - times[first]) / _DAY)
+    return [
+        f"{names[last]} was taken {days} day{'s' if days > 1 else ''} after {names[first]}, by the "
+        "camera's clock: are they of one patient and one visit? Teeth that have moved between "
+        "would be seen in two places."
     ]
 
 
@@ -252,7 +284,7 @@ def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
         )
     shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
     settings = {name: getattr(config, name) for name in sorted(shared)}
-    return ArchOptions(**settings)
+    return ArchOptions(**settings, one_sitting=one_sitting(views))
 
 
 def surface_options(config: DentalConfig) -> SurfaceOptions:

@@ -52,7 +52,7 @@ class Decoder:
         [(reply, arrays)] = self._ask("photo", data, dicom=kind == "DICOM")
         valid = arrays[1] if len(arrays) > 1 else None
         check_size(arrays[0].shape[1], arrays[0].shape[0])
-        return Photo(arrays[0], valid, reply["orientation"], reply["focal_px"])
+        return Photo(arrays[0], valid, **reply)
 
     def mask(self, data: bytes) -> npt.NDArray[np.bool_]:
         """As `decode_mask`."""

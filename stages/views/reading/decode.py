@@ -18,7 +18,13 @@ from PIL import Image, ImageCms
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.pictures import Header, bare_png, look, opened
 from stages.views.orientation import make_stored, make_upright
-from stages.views.reading.exif import EXIF_IFD, focal_in_pixels, read_orientation
+from stages.views.reading.exif import (
+    DATE_TAKEN,
+    EXIF_IFD,
+    focal_in_pixels,
+    read_orientation,
+    taken_at,
+)
 
 Bytes = npt.NDArray[np.uint8]
 Valid = npt.NDArray[np.bool_]
@@ -45,12 +51,20 @@ class Photo:
         valid: [H, W] bool from the alpha channel, or None where there is none.
         orientation: EXIF orientation 1..8, still to be applied.
         focal_px: focal length in stored pixels, or None.
+        taken_at: by the camera's clock, seconds; or None.
     """
 
     rgb: Bytes
     valid: npt.NDArray[np.bool_] | None
     orientation: int
     focal_px: float | None
+    taken_at: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """All but the pixels, by name."""
+        return {
+            "orientation": self.orientation, "focal_px": self.focal_px, "taken_at": self.taken_at,
+        }  # fmt: skip
 
 
 def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = None) -> Photo:
@@ -70,7 +84,8 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
             orientation, (width, height) = _geometry(image, header)
             if check_size is not None:
                 check_size(width, height)
-            focal = focal_in_pixels(_details(image), width, height)
+            details = _details(image)
+            focal = focal_in_pixels(details, width, height)
             profile = image.info.get("icc_profile")
             with _one_large if width * height > LARGE else nullcontext():
                 image.load()
@@ -81,7 +96,7 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
                 valid = None if valid is None else make_stored(valid, orientation)
     except DAMAGED as error:
         raise UnusableFile(_describe_damage(error)) from error
-    return Photo(rgb, valid, orientation, focal)
+    return Photo(rgb, valid, orientation, focal, taken_at(details.get(DATE_TAKEN)))
 
 
 def decode_mask(data: bytes) -> npt.NDArray[np.bool_]:

@@ -26,4 +26,4 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
             return
         photo = decode_photo(data)
     valid = [] if photo.valid is None else [photo.valid]
-    yield {"orientation": photo.orientation, "focal_px": photo.focal_px}, [photo.rgb, *valid]
+    yield photo.facts(), [photo.rgb, *valid]

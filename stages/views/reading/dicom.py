@@ -22,7 +22,7 @@ from pydicom.uid import UID, JPEGLossless, JPEGLosslessSV1
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.pictures import check_size
 from stages.views.reading.decode import Photo, shown
-from stages.views.reading.exif import FOCAL_LENGTH_35MM, focal_in_pixels
+from stages.views.reading.exif import FOCAL_LENGTH_35MM, focal_in_pixels, taken_at
 
 #: SOP classes of photographs.
 CLASSES = {
@@ -40,7 +40,7 @@ _TAGS: list[Any] = [
     "SOPClassUID", "Rows", "Columns", "SamplesPerPixel", "PhotometricInterpretation",
     "PlanarConfiguration", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
     "NumberOfFrames", "PixelData", "ExtendedOffsetTable", "ExtendedOffsetTableLengths",
-    "ICCProfile", "FocalLengthIn35mmFilm",
+    "ICCProfile", "FocalLengthIn35mmFilm", "AcquisitionDateTime",
     *(f"{colour}PaletteColorLookupTable{part}"
       for colour in ("Red", "Green", "Blue") for part in ("Data", "Descriptor")),
 ]  # fmt: skip
@@ -114,7 +114,13 @@ def _decode(data: bytes) -> Photo:
     focal = focal_in_pixels(
         {FOCAL_LENGTH_35MM: found.get("FocalLengthIn35mmFilm")}, width, height
     )  # fmt: skip
-    return Photo(rgb, None, 1, focal)
+    return Photo(rgb, None, 1, focal, _taken_at(str(found.get("AcquisitionDateTime") or "")))
+
+
+def _taken_at(text: str) -> float | None:
+    """Of DICOM's "20261127140559.123+0100"; the zone is left out, as EXIF has none."""
+    parts = text[:4], text[4:6], text[6:8], text[8:10], text[10:12], text[12:14]
+    return taken_at("{}:{}:{} {}:{}:{}".format(*parts))
 
 
 def _pixels(found: Any, colours: str, stored: int) -> tuple[npt.NDArray[Any], int]:

@@ -19,4 +19,4 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
     arrays.clear()
     with large_pictures():
         photo = decode_dicom(data)
-    yield {"orientation": photo.orientation, "focal_px": photo.focal_px}, [photo.rgb]
+    yield photo.facts(), [photo.rgb]

@@ -1,9 +1,14 @@
-"""What EXIF says that matters here: which way is up, and the focal length. Nothing else is read."""
+"""What EXIF says that matters here: which way is up, the focal length, and when it was taken.
+
+Nothing else is read.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 ORIENTATION = 0x0112
@@ -14,6 +19,7 @@ PIXEL_X_DIMENSION = 0xA002
 PIXEL_Y_DIMENSION = 0xA003
 FOCAL_PLANE_X_RESOLUTION = 0xA20E
 FOCAL_PLANE_UNIT = 0xA210
+DATE_TAKEN = 0x9003
 
 DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -59,6 +65,22 @@ def focal_in_pixels(details: Mapping[int, Any], width: int, height: int) -> floa
         return None
     low, high = _PLAUSIBLE
     return focal if low < focal / math.hypot(width, height) < high else None
+
+
+def taken_at(text: Any) -> float | None:
+    """When the camera's clock had it taken, in seconds; None where that is absent or nonsense.
+
+    Clocks say nothing of their zone: good for the time between photographs of one camera.
+
+    Args:
+        text: `DATE_TAKEN` as EXIF has it, "2026:11:27 14:05:59".
+    """
+    try:
+        year, month, day, *time = (int(part) for part in re.split("[: ]", str(text).strip("\0 ")))
+        hour, minute, second = time
+        return datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except (ValueError, OverflowError):
+        return None
 
 
 def _number(value: Any) -> float | None:

@@ -92,6 +92,12 @@ class ArchOptions:
     any_light_match_weight: float = 3.0
     usual_share: float = 0.008
     any_light_cost: float = 4.0
+    #: Were all photographs taken at one sitting, by the camera's clock? None: it doesn't say. What
+    #: that adds to the evidence for one mouth, or takes from it: a factor of 20 to the odds. It is
+    #: an assumption: of photographs that were mixed up, one set in twenty was taken within the
+    #: minutes that a patient's are, and of those of one patient, one in twenty on several days.
+    one_sitting: bool | None = None
+    sitting_evidence: float = 2.0
     #: Median landmark error above which the fit is doubted. This limit, that of epipolar
     #: errors and `confidence.EDGE` lie a third above the most that twelve patients came to, each
     #: also altered in seven ways; the next one a sixth. None of 136 mixes of two patients, nor of

@@ -102,16 +102,20 @@ class SameMouth:
 
 
 def same_mouth(evidence: Evidence, options: ArchOptions) -> SameMouth:
-    """Weigh places of the teeth, colours and dense matches, by the photograph that fits worst."""
+    """Weigh places of the teeth, colours, dense matches, and whether the camera's clock says that
+    it was one sitting; by the photograph that fits worst."""
     one, other = [], []
+    sitting = {True: 1.0, False: -1.0, None: 0.0}[options.one_sitting] * options.sitting_evidence
     for view, (common, colour) in enumerate(
         zip(evidence.common_mouth, evidence.colours, strict=True)
     ):
         places = common / options.common_mouth_unit
         share = max((p.share for pair, p in evidence.pairs.items() if view in pair), default=0.0)
-        one.append(places + options.colour_weight * (options.max_colour - colour.one_light))
+        hue = options.colour_weight * (options.max_colour - colour.one_light)
+        one.append(places + hue + sitting)
         other.append(
             options.any_light_places * places
+            + sitting
             + options.any_light_colour_weight * (options.max_colour - colour.any_light)
             + options.any_light_match_weight * _more_matches(share, options.usual_share)
             - options.any_light_cost

@@ -43,6 +43,8 @@ _NORMAL_SMOOTHING, FACING_SMOOTHING = 0.15, 1.5
 #: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
 #: move with the camera.
 _GUM_FADES = (0.5, 2.0)
+#: No tooth with the gum that goes with it is smaller (square mm; a lower incisor and 10 mm of gum).
+_TOOTH_AND_GUM = 100.0
 #: Tissue is looked for this far around its outline (mm), for the cameras' errors.
 _OUTLINE_ERROR = 0.5
 
@@ -176,7 +178,10 @@ def clearly_seen(
     nearest: list[Array32],
     options: SurfaceOptions,
 ) -> Mask:
-    """[H, W] bool: samples of a chart that some photograph shows, and not at too low an angle."""
+    """[H, W] bool: samples of a chart that some photograph shows, and not at too low an angle.
+
+    Scraps that hang together with no tooth are left out.
+    """
     points = chart.points
     normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
     clear = np.zeros(chart.grid.shape, bool)
@@ -184,7 +189,18 @@ def clearly_seen(
         free = photo.sample(photo.covered, photo.project(points)[0]) < 0.5
         faces = facing(photo, points, normals) > options.least_showing
         clear |= free & faces & sees(photo, front, points, 2 * HIDDEN)
-    return clear
+    used = chart.used(PAST_EDGE, options.gum_height)
+    return clear & ~_scraps(clear & used, chart.grid.density)
+
+
+def _scraps(mask: Mask, density: float) -> Mask:
+    """[H, W] bool: pieces of a mask [H, W] that are too small for a tooth and its gum.
+
+    The largest piece is none of them.
+    """
+    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    area = np.bincount(label[mask], minlength=count)
+    return mask & (area < min(_TOOTH_AND_GUM * density**2, area.max()))[label]
 
 
 def _near_tissue(photo: Photo, jaw: Jaw) -> Array32:
