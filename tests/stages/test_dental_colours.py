@@ -71,7 +71,7 @@ def evidence(one_light: float, any_light: float, common: float, share: float) ->
         (1.0, 1.0, 40.0, 0.0, True),  # one light: matches are not asked for
         (5.0, 1.0, 40.0, 0.03, True),  # another light, all else agrees
         (5.0, 1.0, 40.0, 0.0, False),  # ... but nothing matches
-        (5.0, 4.0, 40.0, 0.03, False),  # ... but gum and enamel differ
+        (5.0, 5.0, 40.0, 0.03, False),  # ... but gum and enamel differ
         (5.0, 1.0, -60.0, 0.03, False),  # ... but the teeth stand elsewhere
     ],
 )

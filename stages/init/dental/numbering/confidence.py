@@ -114,7 +114,7 @@ def same_mouth(evidence: Evidence, options: ArchOptions) -> SameMouth:
         hue = options.colour_weight * (options.max_colour - colour.one_light)
         one.append(places + hue + sitting)
         other.append(
-            options.any_light_places * places
+            min(places, options.any_light_places * places)
             + sitting
             + options.any_light_colour_weight * (options.max_colour - colour.any_light)
             + options.any_light_match_weight * _more_matches(share, options.usual_share)
