@@ -49,6 +49,45 @@ compiled = []
 with news.told_to(compiled.append):
     print(total(np.arange(4.0)), len(compiled))
 """
+#: What the project's kernels do beyond sums, and how a process that compiles nothing does it.
+MORE = """
+import math, sys
+import numpy as np
+from numba import prange
+from pipeline.kernels import kernel, news
+
+@kernel(parallel=True)
+def rooted(values):
+    found = np.empty_like(values)
+    for i in prange(len(values)):
+        found[i] = math.sqrt(values[i])
+    return found
+
+@kernel(nogil=True)
+def solved(matrix, values):
+    if len(values) == 0:
+        raise ValueError("nothing to solve")
+    return np.linalg.solve(matrix, values), np.dot(values, values), np.sort(values)[0]
+"""
+RUN_MORE = """
+import sys
+import numpy as np
+from pipeline.kernels import news
+from sums.more import rooted, solved
+
+compiled = []
+with news.told_to(compiled.append):
+    assert rooted(np.array([4.0, 9.0])).tolist() == [2, 3]
+    found, square, least = solved(2 * np.eye(2), np.array([4.0, 2.0]))
+    assert (found.tolist(), square, least) == ([2, 1], 20, 2)
+    try:
+        solved(np.eye(2), np.empty(0))
+    except ValueError as error:
+        assert "nothing to solve" in str(error)
+    else:
+        raise AssertionError
+print(len(compiled), "numba.typed.typeddict" in sys.modules)
+"""
 
 
 @pytest.fixture
@@ -61,14 +100,14 @@ def sums(tmp_path):
     return package
 
 
-def started(package: Path) -> subprocess.Popen[str]:
+def started(package: Path, code: str = RUN) -> subprocess.Popen[str]:
     environment = {
         **os.environ,
         "PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1",
         "NUMBA_CACHE_DIR": str(package.parent / "cache"),
     }  # fmt: skip
     return subprocess.Popen(
-        [sys.executable, "-c", RUN], env=environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
     )
 
 
@@ -91,6 +130,14 @@ class TestSource:
         assert run(sums) == (120.0, 1)
         assert run(sums) == (120.0, 0)
         assert len(kept(sums)) == 1
+
+    def test_kernels_that_are_kept_need_no_compiler(self, sums):
+        """And work all the same: threads, errors, memory, linear algebra."""
+        (sums / "more.py").write_text(MORE)
+        for said in ("2 True", "0 False"):
+            process = started(sums, RUN_MORE)
+            assert process.communicate(timeout=120)[0].strip() == said
+            assert process.returncode == 0
 
     def test_an_edited_helper_counts_and_old_states_are_deleted(self, sums):
         edits = [("10", "10"), ("2 * value", "3 * value")]
