@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from numba.core import config
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
 from pipeline.kernels import folder as places
