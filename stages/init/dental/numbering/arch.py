@@ -49,12 +49,7 @@ from stages.init.dental.numbering.hypotheses import (
 )
 from stages.init.dental.numbering.matching import Matching
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
-from stages.init.dental.numbering.primary import (
-    ALL_PRIMARY,
-    age_doubts,
-    perhaps_primary,
-    primary_teeth,
-)
+from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
 from stages.init.dental.numbering.rivals import judged_by_pictures, label_doubts, margins
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
@@ -189,8 +184,6 @@ def fit_arch(
     evidence = Evidence(gaps, common, mirrored, colours, bands, pairs)
     more, figures = fit_doubts(shown, scorer, best, evidence, options)
     doubts += more + kind_doubts(best, read, shown)
-    if held is None:
-        doubts += age_doubts(best, read, shown)
     found = _outcome(
         scorer, best, read, placeable, len(dentitions), gaps.cameras, doubts, figures, shares
     )

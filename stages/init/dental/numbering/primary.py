@@ -41,12 +41,6 @@ EVEN_ODDS = -7.0
 LEAST_PROBABILITY = 1e-4
 #: Odds of one crown count no more than this.
 MOST_ODDS = 2.0
-#: Photographs of one mouth differ at the same places by less than this in the mean of their log
-#: odds (which are within `MOST_ODDS` of even): at most 1.7 in twelve patients, each also altered in
-#: seven ways; a child's photograph among two of an adult's, or the reverse, by 2.1 and more (35).
-OTHER_AGE = 1.9
-#: Fewer places compared than this say nothing.
-LEAST_COMPARED = 5
 #: Mean log odds this much below even still ask for a look at a child's arch.
 CHILD_WINDOW = 0.7
 #: Crowns with less probability than this of standing before the molars say nothing.
@@ -108,39 +102,6 @@ def primary_teeth(
 def _back_place(label: int) -> int:
     """Place from the midline of a position along the row, 0 for `NO_TOOTH`."""
     return 0 if label == NO_TOOTH else tooth_at("upper", label) % 10
-
-
-def age_doubts(best: Scored, dentitions: list[Dentition], photos: list[str]) -> list[str]:
-    """A photograph that shows primary teeth where the others show permanent ones, or the reverse:
-    a child's among an adult's.
-
-    Args:
-        best: the labelling.
-        dentitions: the crowns of its photographs.
-        photos: how the user knows these.
-    """
-    odds = [
-        place_odds(replace(best.labelling, labels=(labels,)), [dentition])
-        for dentition, labels in zip(dentitions, best.labelling.labels, strict=True)
-    ]
-    apart = []
-    for view, mine in enumerate(odds):
-        differences = [
-            mine[place] - other[place]
-            for k, other in enumerate(odds)
-            for place in sorted(mine.keys() & other.keys())
-            if k != view
-        ]
-        enough = len(differences) >= LEAST_COMPARED
-        apart.append(float(np.mean(differences)) if enough else 0.0)
-    if not apart or max(map(abs, apart)) < OTHER_AGE:
-        return []
-    odd = int(np.argmax(np.abs(apart)))
-    kind, rest = ("primary", "permanent") if apart[odd] > 0 else ("permanent", "primary")
-    return [
-        f"{photos[odd]} shows {kind} teeth where the others show {rest} ones: it may be another "
-        "patient's"
-    ]
 
 
 def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, float]:
