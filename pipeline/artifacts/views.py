@@ -31,7 +31,7 @@ class View:
         focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
         timestamp: seconds from the start of the video, or None.
         taken_after: by the cameras' clocks, seconds after the first photograph of the case was
-            taken, or None. (When that was is nobody's business, and not kept.)
+            taken, or None. The date itself is not kept.
         lens_taken_out: where the image has been undistorted, the lens that it had before, as a line
             of COLMAP's ``cameras.txt`` without number (model, width, height, parameters);
             `working_from_source` then leads to pixels of the image before.

@@ -51,10 +51,10 @@ with news.told_to(compiled.append):
 """
 #: What the project's kernels do beyond sums, and how a process that compiles nothing does it.
 MORE = """
-import math, sys
+import math
 import numpy as np
 from numba import prange
-from pipeline.kernels import kernel, news
+from pipeline.kernels import kernel
 
 @kernel(parallel=True)
 def rooted(values):

@@ -131,10 +131,10 @@ def one_sitting(views: Views) -> bool | None:
 
     None where it says neither: photographs lose their times when they are sent or edited.
     """
-    times = [view.taken_after for view in views.views]
-    if len(times) < 2 or None in times:
+    times = [view.taken_after for view in views.views if view.taken_after is not None]
+    if len(times) < max(2, len(views)):
         return None
-    between = max(t for t in times if t is not None) - min(t for t in times if t is not None)
+    between = max(times) - min(times)
     return True if between <= _SITTING else False if between >= _DAY else None
 
 

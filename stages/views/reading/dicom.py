@@ -1,4 +1,5 @@
-"""Read one photograph from a DICOM file: pixels, colours and focal length, nothing of its patient.
+"""Read one photograph from a DICOM file: pixels, colours, focal length and time, nothing of its
+patient.
 
 Call this in a child only (`dicom_child`). pydicom is an extra.
 

@@ -180,7 +180,7 @@ def clearly_seen(
 ) -> Mask:
     """[H, W] bool: samples of a chart that some photograph shows, and not at too low an angle.
 
-    Scraps that hang together with no tooth are left out.
+    Pieces too small for a tooth and its gum are left out.
     """
     points = chart.points
     normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
