@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.points import Points
+from pipeline.artifacts.space.frames import Frame
 from pipeline.artifacts.views import Views, to_uint8
 from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, there_and_back, widened
 from stages.export.pictures.video import even
@@ -87,12 +88,13 @@ def assemble(
     cameras: Cameras,
     gaussians: Gaussians,
     points: Points | None,
-    similarity: npt.NDArray[np.float64],
+    frame: Frame,
     threads: int,
     progress: Progress,
 ) -> Scene:
-    """Bring the artifacts into the frame that `similarity` [4, 4] leads to, and render them."""
+    """Bring the artifacts into a frame, and render them."""
     by_name = views.by_name()
+    similarity = frame.from_world
     placed = move_cameras((c for c in cameras.cameras if c.name in by_name), similarity)
     moved = move_gaussians(gaussians, similarity)
     cloud = move_points(points, similarity) if points is not None else centres(moved)
@@ -109,7 +111,11 @@ def assemble(
         gaussians=moved,
         points=cloud,
         seen=tuple(seen),
-        orbit=find_orbit(placed, [central_depth(view.depth, view.alpha) for view in seen]),
+        orbit=find_orbit(
+            placed,
+            [central_depth(view.depth, view.alpha) for view in seen],
+            np.array([0.0, 1.0, 0.0]) if frame.name == "mouth" else None,
+        ),
         frame_from_world=similarity,
         threads=threads,
     )

@@ -33,7 +33,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 13
+    version = 14
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -83,7 +83,7 @@ class ExportStage(Stage):
             cameras,
             context.load("gaussians"),
             context.load("points") if context.has("points") else None,
-            frame.from_world,
+            frame,
             context.threads,
             context.progress,
         )

@@ -147,7 +147,7 @@ def scene_description(
         files: top-level names in the export folder.
         frame: of the exports.
         scale: of that frame.
-        up: direction in that frame that is up in the photographs.
+        up: direction in that frame that is up: the patient's, or that of the photographs.
         counts: what there is how many times.
         skipped: what could not be made -> why.
         versions: of dentalsplat and of the libraries that made the files.

@@ -1,5 +1,7 @@
 """Similarities, the cameras' arrangement, and paths between them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -98,6 +100,21 @@ def test_the_orbit_is_found() -> None:
     assert orbit.azimuths[0] * orbit.azimuths[2] < 0
     assert orbit.middle() == 1
     np.testing.assert_allclose(np.cross(orbit.up, orbit.front) @ orbit.side, 1)
+
+
+def test_photographs_held_askew_are_walked_around_upright() -> None:
+    askew = []
+    tilt = np.eye(4)
+    tilt[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+    for camera in scene.ball_cameras():
+        askew.append(replace(camera, cam_from_world=tilt @ camera.cam_from_world))
+    upwards = np.array([0, -1.0, 0])
+    assert find_orbit(askew, [3.0] * 3).up @ upwards < np.cos(0.2)
+    orbit = find_orbit(askew, [3.0] * 3, upwards)
+    np.testing.assert_allclose(orbit.up, upwards)
+    places, _ = there_and_back(orbit, askew, (64, 48), 20, 0.0)
+    for place in places:
+        assert abs(place.rotation[0] @ upwards) < 1e-9, "level"
 
 
 def test_look_at_keeps_up_upwards_and_does_not_mirror() -> None:

@@ -12,6 +12,7 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply, write_gaussians_ply
+from pipeline.artifacts.space.frames import Frame
 from stages.export.orientation import ON_ITS_BASE, Z_UP, file_from_frame
 from stages.export.scene import assemble
 from stages.export.splatfiles.compressed import compressed_ply_bytes
@@ -60,8 +61,8 @@ def constant_alone(gaussians: Gaussians) -> Gaussians:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     case = scene.ball_case()
     made = assemble(
-        case["views"], case["cameras"], one_sided(), None, np.diag([1.0, -1, -1, 1]), 1,
-        lambda *_: None,
+        case["views"], case["cameras"], one_sided(), None,
+        Frame("upright", np.diag([1.0, -1, -1, 1])), 1, lambda *_: None,
     )  # fmt: skip
     home = tmp_path_factory.mktemp("splats")
     write_splats(home, made, True, ["Lengths are in millimetres: \u00b15 %."])

@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.dental.fdi import ALL_TEETH, is_primary, is_upper
+from pipeline.artifacts.space.frames import Frame
 from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
@@ -196,7 +197,7 @@ def test_a_crown_without_depth_has_no_place() -> None:
     beside = replace(first.upper[0], outline=corner)
     made = assemble(
         inputs["views"], Cameras(inputs["cameras"].cameras[:1]), inputs["gaussians"], None,
-        np.eye(4), 1, lambda *_: None,
+        Frame("world", np.eye(4)), 1, lambda *_: None,
     )  # fmt: skip
     alone = Teeth((replace(first, upper=(beside,), lower=()),))
     found = describe_teeth(alone, inputs["views"], made.cameras, made.seen, "world", NO_SCALE)

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -138,6 +139,16 @@ PROBE = """
   press("r");
   await wait(900);
   result.labelAfterReset = document.getElementById("label").textContent;
+  const camera = new OrbitCamera({ up: [0, -1, 0], front: [0, 0, -1], centre: [0, 0, 0], radius: 1,
+    limits: { azimuth: null, elevation: [-1, 1], distance: [0.1, 9], pan: 1 } });
+  camera.rotation = turned([0, 0, 1], 0.3);
+  result.tilts = [];
+  for (let k = 0; k < 12; k++) {
+    result.tilts.push(Math.asin(camera.rotation[1]));
+    camera.orbit(0.05, 0);
+  }
+  const { azimuth, elevation } = camera.angles();
+  result.turned = [azimuth, elevation];
   const text = document.createElement("pre");
   text.id = "result";
   text.textContent = JSON.stringify({ ...result, state: document.documentElement.dataset.state,
@@ -154,7 +165,9 @@ def test_the_page_can_be_steered(tmp_path: Path) -> None:
     numbers = json.dumps(camera.cam_from_world.ravel().tolist())
     call = f"{numbers}, {camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}, 96, 72"
     file = tmp_path / "probe.html"
-    file.write_text(page().replace("</body>", PROBE.replace("CAMERA", call)))
+    camera_script = files("stages.export.viewer").joinpath("camera.js").read_text()
+    probe = f"<script>{camera_script}</script>" + PROBE.replace("CAMERA", call)
+    file.write_text(page().replace("</body>", probe))
     dom, log = browse(file, tmp_path, (480, 360), "--dump-dom", "--virtual-time-budget=20000")
     assert console(log) == []
     result = json.loads(re.search(r"<pre id=\"result\">(.*?)</pre>", dom, re.S)[1])
@@ -170,6 +183,10 @@ def test_the_page_can_be_steered(tmp_path: Path) -> None:
     assert result["labelAfterDrag"] == ""
     assert result["labelAfterReset"] == "View 2"
     assert result["turning"] == "true"
+    tilts = np.abs(result["tilts"])
+    assert tilts[0] == pytest.approx(0.3), "a photograph is shown as it was taken"
+    assert (np.diff(tilts) < 0).all() and tilts[-1] < 0.01, "turned, it comes to stand level"
+    np.testing.assert_allclose(np.abs(result["turned"]), [0.6, 0], atol=1e-6)
     for what in ("changedByDrag", "farAway", "close", "above", "help", "sameAgain"):
         assert result[what] is True, what
 

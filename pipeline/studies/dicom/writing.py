@@ -137,7 +137,7 @@ def _views(workspace: Path, count: int) -> list[Picture]:
         return []
     frame = frame_of(cameras, "auto")
     scene = assemble(
-        views, cameras, gaussians, case.latest("points"), frame.from_world, usable_cores(),
+        views, cameras, gaussians, case.latest("points"), frame, usable_cores(),
         lambda *said: None,
     )  # fmt: skip
     places = between(scene.orbit, scene.cameras, count)

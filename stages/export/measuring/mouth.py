@@ -55,7 +55,7 @@ def read_mouth(
         views: the photographs as the scene was made of them.
         cameras: of the placed ones, in the frame of the exports.
         seen: the scene as each of these cameras sees it.
-        up: [3] up in the photographs.
+        up: [3] upwards.
         scale: see `measure_mouth`.
     """
     by_name, read = views.by_name(), teeth.by_name()

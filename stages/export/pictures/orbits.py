@@ -29,7 +29,7 @@ class Orbit:
 
     Attributes:
         centre: [3] what the cameras look at.
-        up: [3] unit, upwards as the photographs show it.
+        up: [3] unit, the patient's where that is known; else upwards as the photographs show it.
         front: [3] unit, at right angles to `up`, from the centre towards the middle camera.
         radius: half the width that the photographs frame at the centre's depth.
         azimuths, elevations, distances: [N] of the cameras about the centre; radians, azimuth about
@@ -79,12 +79,15 @@ def central_depth(depth: npt.NDArray[np.floating], alpha: npt.NDArray[np.floatin
     return float(np.median(solid)) if solid.size else None
 
 
-def find_orbit(cameras: Sequence[Camera], known_depths: Sequence[float | None]) -> Orbit:
+def find_orbit(
+    cameras: Sequence[Camera], known_depths: Sequence[float | None], upwards: Array | None = None
+) -> Orbit:
     """Find the frame about which the cameras are arranged.
 
     Args:
         cameras: N >= 1 placed cameras.
         known_depths: N depths of what is in the middle of each picture, None where unknown.
+        upwards: [3] unit, where it is known; else it is what the photographs have up on average.
     """
     eyes = np.stack([camera.centre for camera in cameras])
     forwards = np.stack([camera.rotation[2] for camera in cameras])
@@ -93,7 +96,9 @@ def find_orbit(cameras: Sequence[Camera], known_depths: Sequence[float | None]) 
     depths = np.array([usual if depth is None else depth for depth in known_depths])
     centre = (eyes + forwards * depths[:, None]).mean(0)
 
-    up = unit(-np.stack([camera.rotation[1] for camera in cameras]).mean(0))
+    if upwards is None:
+        upwards = -np.stack([camera.rotation[1] for camera in cameras]).mean(0)
+    up = unit(upwards)
     away = eyes - centre
     distances = np.linalg.norm(away, axis=1)
     flat = away - np.outer(away @ up, up)

@@ -70,6 +70,9 @@ function mirrored(pose, point, normal) {
   };
 }
 
+/** Turned by so much (radians), a tilted camera has lost two thirds of its tilt. */
+const LEVEL_AFTER = 0.15;
+
 /**
  * A camera that looks at a target on its optical axis, and moves about it within limits.
  *
@@ -146,6 +149,20 @@ class OrbitCamera {
     let world = turned(this.orbiting.up, turn);
     if (Math.hypot(...level) > 1e-6) world = product(world, turned(unit(level), lift));
     this.rotation = orthonormal(product(this.rotation, transposed(world)));
+    this.#level(Math.abs(turn) + Math.abs(lift));
+  }
+
+  /** Right the horizon, the more the further the camera was turned: photographs are tilted. */
+  #level(turn) {
+    const [right, down, forward] = [0, 3, 6].map((k) => this.rotation.slice(k, k + 3));
+    const level = cross(forward, this.orbiting.up);
+    if (Math.hypot(...level) < 0.2) return;  // from above or below nothing is level
+    const across = unit(level);
+    const tilt = Math.atan2(dot(down, across), dot(right, across));
+    const by = tilt * (1 - Math.exp(-turn / LEVEL_AFTER));
+    this.rotation = [
+      ...plus(scaled(right, Math.cos(by)), scaled(down, Math.sin(by))),
+      ...plus(scaled(down, Math.cos(by)), scaled(right, -Math.sin(by))), ...forward];
   }
 
   zoom(factor) {
