@@ -158,11 +158,13 @@ def test_three_photographs(yaws: tuple[float, ...]) -> None:
     assert result.doubts == ()
 
 
-def test_a_mouth_of_textbook_size_does_not_come_out_smaller() -> None:
-    """Offsets in true millimetres would be the cheaper the smaller the arch."""
+@pytest.mark.parametrize("height", [1.0, 1.25])
+def test_a_mouth_of_textbook_size_does_not_come_out_smaller(height: float) -> None:
+    """Offsets in true millimetres would be the cheaper the smaller the arch; and long crowns as
+    wide as the textbook's are no small mouth."""
     factors = []
     for seed in (4, 5):
-        points = patient(seed)
+        points = patient(seed) * [1, height, 1]
         shots = [photograph(points, yaw, seed=k) for k, yaw in enumerate((-42.0, 0.0, 42.0))]
         shape = fit([shot[0] for shot in shots], SHORT).shape
         names = [name for name in landmark_names() if name in shape]
@@ -170,7 +172,8 @@ def test_a_mouth_of_textbook_size_does_not_come_out_smaller() -> None:
         true = points[[landmark_names().index(name) for name in names]]
         spreads = [np.linalg.norm(p - p.mean(0), axis=1).mean() for p in (found, true)]
         factors.append(spreads[0] / spreads[1])
-    assert np.mean(factors) == pytest.approx(1, abs=0.05)
+    # 1.05 and 1.03 (the generator's arches are small); by the adjustment alone 1.02 and .94.
+    assert np.mean(factors) == pytest.approx(1.04, abs=0.03)
 
 
 def test_any_order_and_any_number_of_threads_give_the_same() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.artifacts.teeth import Crown, Dentition
+from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.chart.crown_shape import crown_points, crown_radius, jaw_shape
 from stages.init.dental.surface.chart.grid import (
@@ -16,7 +19,12 @@ from stages.init.dental.surface.chart.grid import (
     normals_of,
     unroll,
 )
-from stages.init.dental.surface.chart.jaws import teeth_present
+from stages.init.dental.surface.chart.jaws import (
+    SOLID_PAST_EDGE,
+    Chart,
+    nearest_depths,
+    teeth_present,
+)
 from stages.init.dental.surface.chart.raster import raster_chart, sees
 from stages.init.dental.surface.colour import (
     Showing,
@@ -166,6 +174,42 @@ def test_hidden_points_are_not_seen() -> None:
     points = np.array([[[0, 0, 10.5], [0, 0, 9.5], [0, 0, 5.0], [500, 0, 20]]], np.float32)
     np.testing.assert_array_equal(sees(view, front, points, 1.0)[0], [True, True, False, False])
     assert sees(view, np.zeros_like(front), points, 1.0)[0, 2]
+
+
+def test_a_jaw_hides_nothing_where_the_photograph_shows_the_other() -> None:
+    """The upper chart goes on below its edges: what is seen there lies on the lower crowns."""
+    upper = row_of_teeth()
+    lower = {}
+    for mark, place in upper.items():
+        tooth, neighbour = (
+            t and (t + 30 if t < 20 else t + 10) for t in (mark.tooth, mark.neighbour)
+        )
+        lower[Landmark(mark.kind, tooth, neighbour)] = place * [1, -1, 1] + [0, 3.0, -5.0]
+    charts = []
+    for jaw, marks in (("upper", upper), ("lower", lower)):
+        shape = jaw_shape(jaw, marks, {mark.tooth for mark in marks}, set())
+        assert shape is not None
+        points = crown_points(shape, 0.8, 2.6)
+        grid = grid_around(points, 1.0, 4.0)
+        radius = crown_radius(grid, points, 0.3)
+        charts.append(Chart(shape, grid, radius, np.zeros(grid.shape, np.float32)))
+    view = photo()
+    teeth = np.zeros(view.size, np.float32)
+    teeth[:28] = 1  # less than the upper chart: its crowns' edges come to half the height
+    alone = [
+        raster_chart(view, chart.points, chart.used(SOLID_PAST_EDGE, 1.0))[0] for chart in charts
+    ]
+    both = (alone[0] > 0) & (alone[1] > 0)
+    (front,) = nearest_depths(charts, [view], 1.0, 1)
+    np.testing.assert_array_equal(front[both], alone[0][both])
+
+    view = replace(view, upper=teeth, lower=1 - teeth)
+    (front,) = nearest_depths(charts, [view], 1.0, 1)
+    above, below = both & (teeth > 0), both & (teeth == 0)
+    assert above.sum() > 100 and below.sum() > 10
+    np.testing.assert_array_equal(front[above], alone[0][above])
+    np.testing.assert_array_equal(front[below], alone[1][below])
+    assert (alone[1][below] - alone[0][below]).min() > 2, "behind by the overjet"
 
 
 def test_matching_cost_is_one_minus_correlation() -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
 from data_samples.mouths import Mouth, random_mouth
+from pipeline.artifacts.teeth import filled
 from stages.export.measuring.landmarks import read_landmarks
 from stages.export.measuring.measures import measure_mouth, mouth_axes
 from tests.stages.measured_mouth import YAWS, photographed, truth
@@ -164,6 +166,35 @@ def test_the_axes_are_the_mouths_own() -> None:
     np.testing.assert_allclose(mouth_axes(upper_only, turn @ UP) @ turn, np.eye(3), atol=0.12)
     front = {key: p for key, p in places.items() if key[1] in (11, 21, 31, 41)}
     np.testing.assert_allclose(mouth_axes(front, turn @ UP) @ turn, np.eye(3), atol=0.3)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_the_upper_edges_that_a_scene_draws_too_long_make_no_reverse_bite(seed: int) -> None:
+    """Beside the upper edges a scene may show their depth where the lower crowns are seen."""
+    mouth = grown(seed, overjet=5.0)
+    dentitions, cameras, depths = photographed(mouth)
+    drawn = []
+    for dentition, depth in zip(dentitions, depths, strict=True):
+        upper = filled(dentition.upper, dentition.size)
+        nearest = np.where(upper, depth, np.inf).astype(np.float32)
+        longer = cv2.erode(nearest, np.ones((7, 7), np.uint8))  # three pixels
+        drawn.append(np.where(np.isfinite(longer) & (depth > 0), longer, depth))
+    found = {
+        entry["name"]: entry
+        for entry in measure_mouth(read_landmarks(dentitions, cameras, drawn), UP, MM)
+    }
+    assert abs(found["overjet"]["value"] - truth(mouth)["overjet"]) < 1
+
+
+def test_the_midline_is_where_the_central_incisors_meet() -> None:
+    """Photographs from the sides show another place, and count only where there is no other."""
+    mouth = grown(3, midline=2.5)
+    assert measured(mouth)["midline_shift"]["value"] == pytest.approx(
+        truth(mouth)["midline_shift"], abs=0.4
+    )
+    sides = measured(mouth, ((-42.0, 4.0), (40.0, 4.0)))["midline_shift"]
+    assert sides["value"] is None
+    assert sides["not_visible"] == "no photograph from the front shows where 11 and 21 meet"
 
 
 def test_nothing_seen_is_said_so() -> None:

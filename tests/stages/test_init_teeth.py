@@ -59,7 +59,7 @@ def run(
 def test_outputs_agree_with_each_other_and_lead_back_to_millimetres(tmp_path, monkeypatch):
     context = run(tmp_path, monkeypatch, found_teeth())
     cameras = context.result("cameras")
-    assert cameras.scale == Scale("mm", "textbook_teeth", 15.0) and not cameras.provisional
+    assert cameras.scale == Scale("mm", "textbook_teeth", 10.0) and not cameras.provisional
     for camera, yaw in zip(cameras.cameras, (-40, 0, 40), strict=True):
         mm_from_cam = cameras.input_from_world @ np.linalg.inv(camera.cam_from_world)
         np.testing.assert_allclose(

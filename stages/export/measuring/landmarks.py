@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import is_left
+from pipeline.artifacts.dental.fdi import JAWS, is_left, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, filled
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 #: rim: middle of where the crown ends towards the other jaw; tip: the same if that is its biting
 #: edge, not covered by the other jaw; edge: the crown's face beside it; centre: middle of the
-#: crown's face; mesial: where the biting edge ends towards the midline; zenith: where the gum's
+#: crown's face; mesial: where it meets the other side's central incisor; zenith: where the gum's
 #: edge lies highest on the crown (lowest, in the lower jaw).
 Name = Literal["tip", "rim", "edge", "centre", "mesial", "zenith"]
 
@@ -30,8 +30,11 @@ LEAST_PARALLAX = 0.05
 #: A crown seen at an angle shows a part of its edge only: its middle may be off by this share of
 #: the width that is missing.
 FORESHORTENED = 0.3
-#: A photograph in which a crown has this share of its greatest width shows it straight on.
-STRAIGHT = 0.93
+#: Rays that come to the midline from a side by no more than this sine come from in front.
+IN_FRONT = 0.42
+#: Outlines are nearest to each other where their distance exceeds the least one by no more than
+#: this share of a crown's width.
+NEAREST = 0.06
 #: Rays that come to a back tooth from the other side by more than this sine meet its inner face.
 INNER = 0.3
 #: The face next to the biting edge is this share of the crown's height inside its outline: the
@@ -43,6 +46,10 @@ TOUCHING = 0.06
 SAME_DEPTH = 0.005
 #: Depth is taken within this share of the crown's height around a landmark, inside the crown.
 REACH = 0.15
+#: Where the other jaw covers the edge, depth this near to its crowns (share of the crown's height)
+#: may be theirs: it is taken from further inside, from a larger part of the crown. On 20 mouths,
+#: from whole runs, the overjet is off by .6 mm with .15 to .3 and .45 to .6, by 1.9 without.
+BESIDE, REACH_BEHIND = 0.2, 0.5
 _LEAST_PIXELS, _PLANE_PIXELS = 3, 10
 
 
@@ -112,19 +119,29 @@ def read_landmarks(
     sightings: dict[tuple[Name, int], list[Sighting]] = {}
     edges_seen: dict[int, list[bool]] = {}
     for dentition, camera, depth in zip(dentitions, cameras, depths, strict=True):
-        for crown, covered in _numbered(dentition, depth):
+        crowns = _numbered(dentition, depth)
+        meeting = _meeting_places({crown.number: crown for crown, _ in crowns})
+        for crown, covered in crowns:
             edges_seen.setdefault(crown.number, []).append(not covered)
             inside = filled((crown,), dentition.size)
-            for name, pixel in _places(crown, covered).items():
-                sighting = _lift(crown, pixel, inside, camera, depth)
+            clear = inside & ~_beside_other_jaw(crown, dentition) if covered else inside
+            places = _places(crown, covered)
+            if crown.number in meeting:
+                places["mesial"] = meeting[crown.number]
+            for name, pixel in places.items():
+                at_rim = covered and name in ("rim", "edge")
+                sighting = _lift(
+                    crown, pixel, clear if at_rim else inside, camera, depth,
+                    REACH_BEHIND if at_rim else REACH,
+                )  # fmt: skip
                 if sighting is not None:
                     sightings.setdefault((name, crown.number), []).append(sighting)
     joined = {}
     left = _leftward(sightings)
     for key, seen in sightings.items():
-        outside = [sighting for sighting in seen if _from_outside(key[1], sighting, left)]
+        outside = [sighting for sighting in seen if _shows(key, sighting, left)]
         if outside:
-            joined[key] = _joined(_straight_on(key[0], outside))
+            joined[key] = _joined(outside)
     never = frozenset(number for number, seen in edges_seen.items() if not any(seen))
     return Reading(joined, never)
 
@@ -145,19 +162,44 @@ def _area(crown: Crown) -> float:
 
 
 def _covered(crown: Crown, dentition: Dentition, depth: npt.NDArray[np.floating]) -> bool:
-    """Does a crown end where one of the other jaw begins, that may be nearer to the camera?"""
+    """Does a crown end where one of the other jaw begins, that may be nearer to the camera?
+
+    At its tip or along most of its edge: in the notch between two crowns a corner may be free.
+    """
+    if _covered_at(crown.tip, crown, dentition, depth):
+        return True
+    places = _along_edge(crown)
+    return sum(_covered_at(place, crown, dentition, depth) for place in places) > len(places) / 2
+
+
+def _along_edge(crown: Crown) -> list[Array]:
+    """Pixels [2] where a crown's outline ends towards the other jaw: amid it, and to both sides."""
+    height = max(float(np.linalg.norm(crown.tip - crown.zenith)), 1e-9)
+    down = (crown.tip - crown.zenith) / height
+    outline = np.asarray(crown.outline, np.float64).reshape(-1, 2)
+    from_centre = outline - crown.centre
+    along, across = from_centre @ down, from_centre @ np.array([-down[1], down[0]])
+    middle, half = (across.max() + across.min()) / 2, np.ptp(across) / 2
+    near = [np.abs(across - middle - side * half) < 0.25 * half for side in (-0.5, 0.0, 0.5)]
+    return [outline[n][np.argmax(along[n])] for n in near if n.any()] or [crown.tip]
+
+
+def _covered_at(
+    place: Array, crown: Crown, dentition: Dentition, depth: npt.NDArray[np.floating]
+) -> bool:
+    """Does a crown of the other jaw begin at a pixel [2], that may be nearer to the camera?"""
     height = float(np.linalg.norm(crown.zenith - crown.tip))
     others = dentition.crowns("lower" if crown.jaw == "upper" else "upper")
     for other in others:
         if len(other.outline) < 3:
             continue
         gap = -cv2.pointPolygonTest(
-            other.outline.astype(np.float32), tuple(map(float, crown.tip)), True
+            other.outline.astype(np.float32), tuple(map(float, place)), True
         )
         if gap > TOUCHING * max(height, float(np.linalg.norm(other.zenith - other.tip))):
             continue
-        mine = _depth_near(crown.tip, height * REACH, filled((crown,), dentition.size), depth)
-        theirs = _depth_near(crown.tip, height * 0.3, filled((other,), dentition.size), depth)
+        mine = _depth_near(place, height * REACH, filled((crown,), dentition.size), depth)
+        theirs = _depth_near(place, height * 0.3, filled((other,), dentition.size), depth)
         if mine is None or theirs is None or theirs <= mine * (1 + SAME_DEPTH):
             return True
     return False
@@ -171,11 +213,29 @@ def _places(crown: Crown, covered: bool) -> dict[Name, Array]:
         found["tip"] = crown.tip
     if not crown.doubtful:  # else the picture's border may have cut it
         found["zenith"] = crown.zenith
-    # A photograph shows the patient's left on its right.
-    mesial = crown.embrasure_left if is_left(crown.number) else crown.embrasure_right
-    if mesial is not None and crown.number % 10 == 1:
-        found["mesial"] = mesial
     return found
+
+
+def _meeting_places(crowns: Mapping[int, Crown]) -> dict[int, Array]:
+    """Central incisor -> pixel [2] where it meets that of the other side, or is nearest to it."""
+    found = {}
+    for jaw in JAWS:
+        sides: tuple[list[Crown], list[Crown]] = ([], [])
+        for number, crown in crowns.items():
+            if number % 10 == 1 and is_upper(number) == (jaw == "upper"):
+                sides[is_left(number)].append(crown)
+        if all(sides):
+            right, left = (side[0] for side in sides)
+            found[right.number] = found[left.number] = _between(right, left)
+    return found
+
+
+def _between(one: Crown, other: Crown) -> Array:
+    """[2] the middle of the stretch along which two outlines are nearest to each other."""
+    a, b = (np.asarray(crown.outline, np.float64).reshape(-1, 2) for crown in (one, other))
+    apart = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    near = apart <= apart.min() + NEAREST * min(one.width, other.width)
+    return np.asarray((a[near.any(1)].mean(0) + b[near.any(0)].mean(0)) / 2)
 
 
 def _depth_near(
@@ -209,11 +269,20 @@ def _window(pixel: Array, reach: float, shape: tuple[int, ...]) -> tuple[slice, 
     return slice(low[1], max(high[1], low[1])), slice(low[0], max(high[0], low[0]))
 
 
-def _lift(
-    crown: Crown, pixel: Array, inside: Bools, camera: Camera, depth: npt.NDArray[np.floating]
-) -> Sighting | None:
+def _beside_other_jaw(crown: Crown, dentition: Dentition) -> Bools:
+    """[H, W] bool: next to the crowns of the other jaw, whose depth the scene may show there."""
     height = float(np.linalg.norm(crown.zenith - crown.tip))
-    z = _depth_near(pixel, REACH * height, inside, depth)
+    others = dentition.crowns("lower" if crown.jaw == "upper" else "upper")
+    free = 1 - filled(others, dentition.size).astype(np.uint8)
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) < BESIDE * height)
+
+
+def _lift(
+    crown: Crown, pixel: Array, inside: Bools, camera: Camera,
+    depth: npt.NDArray[np.floating], reach: float,
+) -> Sighting | None:  # fmt: skip
+    height = float(np.linalg.norm(crown.zenith - crown.tip))
+    z = _depth_near(pixel, reach * height, inside, depth)
     if z is None:
         return None
     local = np.array([(pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy, 1])
@@ -241,19 +310,16 @@ def _leftward(sightings: Mapping[tuple[Name, int], Sequence[Sighting]]) -> Array
     return np.asarray(left / max(float(np.linalg.norm(left)), 1e-12))
 
 
-def _from_outside(number: int, sighting: Sighting, left: Array) -> bool:
-    """Is it a back tooth's outer face? Through an open bite a photograph shows the inner one."""
-    if number % 10 < 4:
-        return True
-    return bool(-sighting.ray @ left * (1 if is_left(number) else -1) > -INNER)
+def _shows(mark: tuple[Name, int], sighting: Sighting, left: Array) -> bool:
+    """Where two crowns meet is another place from each side: only what sees them from in front.
 
-
-def _straight_on(name: Name, seen: Sequence[Sighting]) -> list[Sighting]:
-    """Where two crowns meet is another place from each side: only what sees them straight on."""
-    if name != "mesial":
-        return list(seen)
-    widest = max(sighting.width for sighting in seen)
-    return [sighting for sighting in seen if sighting.width >= STRAIGHT * widest]
+    And of a back tooth its outer face: through an open bite a photograph shows the inner one.
+    """
+    name, number = mark
+    from_left = float(-sighting.ray @ left)
+    if name == "mesial":
+        return abs(from_left) < IN_FRONT
+    return number % 10 < 4 or from_left * (1 if is_left(number) else -1) > -INNER
 
 
 def _joined(seen: Sequence[Sighting]) -> Landmark:

@@ -273,7 +273,7 @@ def _why(name: Name, group: Sequence[int], rule: Rule, reading: Reading) -> str:
     if any((mark := reading.get("edge", n)) and mark.doubt > MOST_DOUBT for n in seen):
         return f"it is not sure which tooth is {named}"
     if name == "mesial" and seen:
-        return f"no photograph shows where {group[0]} and {group[1]} meet"
+        return f"no photograph from the front shows where {group[0]} and {group[1]} meet"
     return f"no photograph shows {named} with depth"
 
 
@@ -345,7 +345,7 @@ RULES = (
     Rule(
         "overjet", "Overjet",
         "from the edges of the upper central incisors straight back to the faces of the lower ones",
-        (("rim", (11, 21)), ("edge", (31, 41))), _overjet, 0.06, ("", "reversed"),
+        (("rim", (11, 21)), ("edge", (31, 41))), _overjet, 0.08, ("", "reversed"),
     ),
     Rule(
         "overbite", "Overbite",
@@ -356,7 +356,7 @@ RULES = (
     Rule(
         "midline_shift", "Midline shift",
         "from the upper to the lower midline, where the central incisors meet",
-        (("mesial", (11, 21)), ("mesial", (31, 41))), _midline, 0.05,
+        (("mesial", (11, 21)), ("mesial", (31, 41))), _midline, 0.03,
         ("lower midline to the patient's left", "lower midline to the patient's right"),
     ),
     *(_canines(jaw, right, left) for jaw, right, left in (("upper", 13, 23), ("lower", 43, 33))),

@@ -69,7 +69,7 @@ class ArchFit:
     shape: dict[Landmark, Array]
     margin: float
     doubts: tuple[str, ...] = ()
-    scale_uncertainty: float = 0.15
+    scale_uncertainty: float = 0.1
     figures: dict[str, float] = field(default_factory=dict)
     primary: frozenset[int] = frozenset()
     confidence: float = 0.0

@@ -137,11 +137,21 @@ def start_chart(jaw: Jaw, fit: ArchFit, options: SurfaceOptions) -> Chart | None
 def nearest_depths(
     charts: list[Chart], photos: list[Photo], gum: float, threads: int
 ) -> list[Array32]:
-    """Per photograph the z-depth [h, w] of the nearest chart: what hides what."""
-    meshes = [(chart.points, chart.used(SOLID_PAST_EDGE, gum)) for chart in charts]
+    """Per photograph the z-depth [h, w] of the nearest chart: what hides what.
+
+    Where a photograph shows one jaw the other one hides nothing: its chart goes on beyond its edges,
+    and past the notches between crowns, over what is seen below them.
+    """
+    meshes = [(chart.shape.jaw, chart.points, chart.used(SOLID_PAST_EDGE, gum)) for chart in charts]
 
     def nearest(photo: Photo) -> Array32:
-        return nearest_of([raster_chart(photo, points, used)[0] for points, used in meshes])
+        depths = []
+        for jaw, points, used in meshes:
+            depth = raster_chart(photo, points, used)[0]
+            other: Jaw = "lower" if jaw == "upper" else "upper"
+            depth[(photo.tooth_of(other) > 0) | (photo.gum_of(other) > 0)] = 0
+            depths.append(depth)
+        return nearest_of(depths)
 
     return in_threads(nearest, photos, threads)
 
