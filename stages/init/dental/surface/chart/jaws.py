@@ -139,8 +139,8 @@ def nearest_depths(
 ) -> list[Array32]:
     """Per photograph the z-depth [h, w] of the nearest chart: what hides what.
 
-    Where a photograph shows one jaw the other one hides nothing: its chart goes on beyond its edges,
-    and past the notches between crowns, over what is seen below them.
+    Where a photograph shows one jaw the other one hides nothing: its chart goes on beyond its
+    edges, and past the notches between crowns, over what is seen below them.
     """
     meshes = [(chart.shape.jaw, chart.points, chart.used(SOLID_PAST_EDGE, gum)) for chart in charts]
 
