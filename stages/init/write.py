@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Cameras
-from pipeline.artifacts.dental.fdi import is_primary
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.points import Points
@@ -19,7 +18,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import StageContext
 from stages.init.config import InitConfig
-from stages.init.mouth import mouth_frame, textbook_scale, tooth_places
+from stages.init.mouth import mouth_frame, primary_places, textbook_scale, tooth_places
 from stages.init.scale import mm_per_unit, photo_named
 from stages.init.sfm.matching.pictures import Links, match_pictures, match_table
 
@@ -105,17 +104,11 @@ def _with_mouth(
     """The cameras with what the numbered teeth say: how the mouth lies, and how large it is."""
     places = tooth_places(teeth, placed, cameras.cameras, depths)
     cameras = replace(cameras, mouth_from_world=mouth_frame(places))
-    scale = textbook_scale(places)
-    # another size than the textbook's: a child's teeth; given cameras keep their own world
-    if scale is None or cameras.given or cameras.scale.unit == "mm" or _primary(teeth):
+    scale = textbook_scale(places, primary_places(teeth))
+    # given cameras keep their own world
+    if scale is None or cameras.given or cameras.scale.unit == "mm":
         return cameras
     return _in_millimetres(cameras, scale[0], "textbook_teeth", scale[1])
-
-
-def _primary(teeth: Teeth) -> bool:
-    """Is there a primary tooth among those that are numbered?"""
-    numbers = [crown.number for read in teeth.chosen for crown in read.all_crowns]
-    return any(number and is_primary(number) for number in numbers)
 
 
 def _in_millimetres(cameras: Cameras, factor: float, source: Source, deviation: float) -> Cameras:

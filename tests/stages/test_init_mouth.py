@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import other_side
+from pipeline.artifacts.dental.fdi import ALL_TEETH, other_side
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from stages.init.dental.template import landmark_names, textbook_arch
-from stages.init.mouth import mouth_frame, textbook_scale, tooth_places
+from stages.init.mouth import mouth_frame, primary_places, textbook_scale, tooth_places
 
 
 def textbook():
@@ -125,6 +125,31 @@ def test_textbook_teeth_tell_millimetres(somewhere) -> None:
     factor, deviation = textbook_scale(places)
     assert factor == pytest.approx(10, rel=0.06)
     assert 0.1 <= deviation < 0.13
+
+
+def test_primary_teeth_tell_millimetres_by_their_own_widths() -> None:
+    primary = frozenset(tooth for tooth in ALL_TEETH if tooth < 50 and tooth % 10 < 6)
+    arch = textbook_arch(frozenset(), primary)
+    names = landmark_names()
+    places = {
+        (mark.kind, mark.tooth): arch[k] / 10
+        for k, mark in enumerate(names) if mark.kind == "tip" and mark.tooth in primary
+    }  # fmt: skip
+    assert textbook_scale(places, primary)[0] == pytest.approx(10, rel=0.08)
+    assert textbook_scale(places)[0] > 11, "taken for permanent teeth"
+
+
+def test_one_primary_tooth_in_a_few_photographs_is_not_a_childs_mouth() -> None:
+    def read(numbers: dict[int, float]) -> Dentition:
+        at = np.zeros(2)
+        crowns = [
+            Crown("upper", at, at, None, None, None, None, 10, 60, number=number, doubt=doubt)
+            for number, doubt in numbers.items()
+        ]
+        return Dentition("", (160, 120), "front", tuple(crowns))
+
+    frames = ({55: 0.1, 14: 0.1}, {15: 0.1, 54: 0.9}, {15: 0.1}, {74: 0.1})
+    assert primary_places(Teeth(tuple(map(read, frames)))) == {34}
 
 
 def test_a_few_teeth_tell_no_scale() -> None:
