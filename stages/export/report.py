@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+import json
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
-from pipeline.pages.parts import Hero, Link
+from pipeline.pages.parts import Hero, Link, Section, Text
 from pipeline.pages.pictures import from_file
+from pipeline.pages.tables import Cell, Table
 from pipeline.stage import Parts
 
 if TYPE_CHECKING:
@@ -40,4 +42,43 @@ def preview(case: Case) -> Iterator[Hero]:
             return
 
 
-PARTS: Parts = {"preview": preview, "links": links}
+def measurements(case: Case) -> Iterator[Section]:
+    """Overjet, overbite and the like, each with how sure it is, or why it can't be had."""
+    for name in case.providers("exports")[::-1]:
+        folder = case.folder(name, "exports")
+        if folder is None or not (folder / "teeth.json").is_file():
+            continue
+        found = json.loads((folder / "teeth.json").read_text())
+        entries, scale = found.get("measurements", ()), found.get("scale", {})
+        if not entries:
+            return
+        rows = [_measured(entry) for entry in entries]
+        notes = [
+            "By itself, from the teeth's numbers and outlines: check those first. The uncertainty "
+            "holds in 19 of 20 cases, that of the scale in it. How each is measured says the "
+            "viewer, which also draws it.",
+            str(scale.get("text", "")),
+        ]
+        blocks = [Table(("", "value", "how sure"), rows, stacked=True)]
+        texts = [Text(note, soft=True) for note in notes if note]
+        yield Section("Measured on the teeth", [*blocks, *texts], place="chapter")
+        return
+
+
+def _measured(entry: Mapping[str, Any]) -> list[Cell]:
+    """A row: what, how much, and how sure that is."""
+    title = Cell(str(entry["title"]))
+    if entry["value"] is None:
+        return [title, Cell("not visible"), Cell(str(entry["not_visible"]))]
+    value, off = entry["value"], entry["uncertainty"]
+    unit, digits = (" mm", 1) if entry["unit"] == "mm" else (" (no scale)", 3)
+    signed = entry["name"] in ("overjet", "overbite")
+    shown = value if signed else abs(value)
+    said = [entry["direction"], entry["sure"]]
+    if entry["estimated"]:
+        said = ["estimated", *said]
+    remark = "; ".join(word for word in said if word)
+    return [title, Cell(f"{shown:.{digits}f} ± {off:.{digits}f}{unit}"), Cell(remark)]
+
+
+PARTS: Parts = {"preview": preview, "links": links, "measurements": measurements}
