@@ -19,6 +19,7 @@ import pytest
 from pipeline.artifacts import KINDS
 from pipeline.errors import RequestError
 from pipeline.stage import get_stage
+from pipeline.studies.batch.summary import COLUMNS
 from tests.studies import toy_batch
 
 pytest.importorskip("distributed")
@@ -91,6 +92,11 @@ def test_cases_are_run_once_and_seen_again(run: Any, tmp_path: Path) -> None:
     assert rows["clinic/b"]["viewer"] == "cases/clinic__b/results/viewer.html"
     assert (tmp_path / "out" / rows["clinic/b"]["viewer"]).is_file()
     assert "empty" in rows["empty"]["reason"]
+    assert one["measured"] == {"overjet": {"value": -1.25, "uncertainty": 0.5, "estimated": False}}
+    measured = {name: rows["clinic/b"][name] for name in COLUMNS if name.endswith("_mm")}
+    assert measured.pop("overjet_mm") == "-1.25"
+    assert measured.pop("overjet_uncertainty_mm") == "0.5"
+    assert set(measured.values()) == {""}
     again = run()
     assert computed(tmp_path) == {}
     assert again == found

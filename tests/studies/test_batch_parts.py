@@ -16,7 +16,8 @@ from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
 from pipeline.studies.batch.keep import keep_results
 from pipeline.studies.batch.listing import read_cases
 from pipeline.studies.batch.records import Case, new_record
-from pipeline.studies.batch.summary import csv_text, write_summary
+from pipeline.studies.batch.summary import MEASURED, csv_text, write_summary
+from stages.export.measuring.measures import RULES
 
 HOSTILE = (
     "../../etc", "a/b", "a__b", "A__B", "con", "<script>alert(1)</script>", "ü", ".",
@@ -149,6 +150,16 @@ def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:
     assert len(rows) == 950
     assert rows[0]["reason"] == f"'=cmd {bad} second line"
     assert (rows[1]["name"], rows[1]["psnr"]) == ("'=1+1", "31.25")
+
+
+def test_the_table_has_all_that_is_measured() -> None:
+    assert tuple(rule.name for rule in RULES) == MEASURED
+    estimated = {"overbite": {"value": 3.5, "uncertainty": 2.25, "estimated": True}}
+    (row,) = csv.DictReader(
+        io.StringIO(csv_text([new_record(Case("a", "a"), "done", measured=estimated)]))
+    )
+    assert (row["overbite_mm"], row["overbite_uncertainty_mm"]) == ("3.5", "2.25")
+    assert row["overbite_is_estimated"] == "yes"
 
 
 def test_what_a_case_is_kept_for_may_take_more_room_than_the_rest(tmp_path: Path) -> None:

@@ -92,7 +92,12 @@ class ExportStage(Stage):
     def run(self, context: StageContext) -> None:
         log(self, context)
         folder = context.output("exports")
-        (folder / "teeth.json").write_text(json.dumps({"teeth": [11, 12, 13]}))
+        overjet = {
+            "name": "overjet", "value": -1.25, "uncertainty": 0.5, "unit": "mm", "estimated": None,
+        }  # fmt: skip
+        hidden = {**overjet, "name": "overbite", "value": None}
+        found = {"teeth": [11, 12, 13], "measurements": [overjet, hidden]}
+        (folder / "teeth.json").write_text(json.dumps(found))
         (folder / "viewer.html").write_text("<p>a scene")
         (folder / "splats.ply").write_bytes(bytes(9_000_000))
         (folder / "mesh.ply").write_bytes(bytes(1000))

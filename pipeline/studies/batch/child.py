@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -162,12 +163,14 @@ def _figures(summary: RunSummary) -> dict[str, Any]:
     for stage in summary.stages:
         told |= stage.figures["summary"]
         warnings += stage.warnings
-    teeth = None
+    teeth, measured = None, {}
     if summary.results is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            teeth = len(json.loads((summary.results / "teeth.json").read_text())["teeth"])
+            found = json.loads((summary.results / "teeth.json").read_text())
+            teeth, measured = len(found["teeth"]), _measured(found.get("measurements", ()))
     return {
         "teeth": teeth,
+        "measured": measured,
         "photographs": told.get("views_total", told.get("views")),
         "placed": told.get("views_registered"),
         "psnr": told.get("psnr"),
@@ -175,6 +178,17 @@ def _figures(summary: RunSummary) -> dict[str, Any]:
         "warnings": warnings,
         "key": sha256_text(canonical_json([stage.key for stage in summary.stages])),
     }
+
+
+def _measured(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Name -> value and uncertainty in mm, and whether it is estimated; of what has a value."""
+    return {
+        entry["name"]: {
+            "value": entry["value"], "uncertainty": entry["uncertainty"],
+            "estimated": entry["estimated"] is not None,
+        }
+        for entry in entries if entry["value"] is not None and entry["unit"] == "mm"
+    }  # fmt: skip
 
 
 def _trimmed(record: dict[str, Any], job: dict[str, Any], workspace: Path) -> dict[str, Any]:

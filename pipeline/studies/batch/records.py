@@ -119,8 +119,8 @@ def new_record(case: Case, state: str, reason: str = "", **more: Any) -> dict[st
         "id": case.id, "name": case.name, "state": state, "reason": reason, "like": case.like,
         "files": case.stamps, "contents": [], "settings": "", "session": "", "attempts": 0,
         "host": "", "seconds": None, "peak_memory_mb": None, "teeth": None, "placed": None,
-        "photographs": len(case.files) or None, "psnr": None, "ssim": None, "warnings": [],
-        "kept": "", "left_out": [], "bytes": None, "links": {}, **more,
+        "photographs": len(case.files) or None, "psnr": None, "ssim": None, "measured": {},
+        "warnings": [], "kept": "", "left_out": [], "bytes": None, "links": {}, **more,
     }  # fmt: skip
 
 

@@ -14,10 +14,16 @@ from pipeline.files import write_atomic
 from pipeline.pages.page import seconds, write_page
 from pipeline.studies.batch.records import STATES
 
+#: Measurements of `teeth.json`; in the table each has a value and an uncertainty, millimetres.
+MEASURED = (
+    "overjet", "overbite", "midline_shift", "intercanine_upper", "intercanine_lower",
+    "intermolar_upper", "intermolar_lower",
+)  # fmt: skip
 COLUMNS = (
     "name", "state", "reason", "like", "photographs", "placed", "teeth", "psnr", "ssim", "seconds",
     "peak_memory_mb", "bytes", "warnings", "attempts", "host", "folder", "viewer", "report",
-    "check",
+    "check", *(f"{name}{ending}" for name in MEASURED for ending in ("_mm", "_uncertainty_mm")),
+    "overbite_is_estimated",
 )  # fmt: skip
 #: What a spreadsheet would take for a formula.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -58,9 +64,22 @@ def csv_text(records: Sequence[Mapping[str, Any]]) -> str:
             **record, "warnings": len(record["warnings"]), "folder": place if links else "",
             "reason": " ".join(record["reason"].split()), 
             **dict.fromkeys(("viewer", "report", "check"), ""), **links,
+            **_measurements(record["measured"]),
         }  # fmt: skip
         writer.writerow([_plain(told[name]) for name in COLUMNS])
     return stream.getvalue()
+
+
+def _measurements(measured: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The columns of what was measured on a case's teeth."""
+    columns: dict[str, Any] = {}
+    for name in MEASURED:
+        entry = measured.get(name, {})
+        columns[f"{name}_mm"] = entry.get("value")
+        columns[f"{name}_uncertainty_mm"] = entry.get("uncertainty")
+    estimated = measured.get("overbite", {}).get("estimated")
+    columns["overbite_is_estimated"] = None if estimated is None else ("yes" if estimated else "no")
+    return columns
 
 
 def _plain(value: Any) -> Any:
@@ -85,6 +104,7 @@ def _row(
         "tone": TONES.get(record["state"], ""),
         "placed": placed,
         "time": seconds(record["seconds"]),
+        "overjet": record["measured"].get("overjet"),
         "picture": quote(picture) if (out / picture).is_file() else "",
         "links": [
             (quote(f"{place}/{path}{'/' if name == 'results' else ''}"), name)
