@@ -137,7 +137,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
             for k in range(3):
                 colors[agree, k] = images[v, i, j, k]
             lumas[agree] = colors[agree].sum()
-        if refuted > agree or (is_fill and refuted > 0):
+        if refuted > 0 and (refuted >= agree or is_fill):
             continue
         if explained and merge:
             continue
@@ -191,7 +191,8 @@ def fuse(
     """Fuse depth maps: confident surfaces once, fill where nothing better is, colours without
     highlights.
 
-    A depth stays unless more views see through it than agree with it. Where views agree, the most
+    A depth stays unless as many views see through it as agree with it (two of three wide photographs
+    draw the upper incisors too long, over the lower ones that the third one sees). Where views agree, the most
     confident pixel stays with the depth that all of them say (weighted by confidence - 1) and the
     weighted median colour; the others are dropped, as in InstantSplat's co-visibility pruning. Fill
     is dropped wherever a confident surface explains or refutes it.

@@ -225,6 +225,24 @@ def test_floaters_are_refuted_and_fill_yields_to_measurements(world):
     assert alone.fill == len(range(61, 70, 3)) * len(range(40, 60, 3))
 
 
+def test_a_view_that_sees_through_counts_as_much_as_one_that_agrees(world):
+    cameras, images, depths = (part[:3] for part in world)
+    trust = [np.full(z.shape, 5.0, np.float32) for z in depths]
+    spoiled = [z.copy() for z in depths]
+    patch = np.zeros(depths[0].shape, bool)
+    patch[40:60, 45:65] = True
+    spoiled[0][patch] *= 0.9
+    false = cameras[0].unproject(spoiled[0])[patch]
+    pixels, z = cameras[1].project(false.reshape(-1, 3))
+    columns, rows = np.floor(pixels).astype(int).T
+    spoiled[1][rows, columns] = z  # the second view agrees, the third sees what is behind
+    cloud = fuse(spoiled, trust, images, cameras, FusionOptions(), 2)
+    distance = cKDTree(false.reshape(-1, 3)).query(cloud.positions)[0]
+    believed = fuse(spoiled[:2], trust[:2], images[:2], cameras[:2], FusionOptions(), 2)
+    assert (cKDTree(false.reshape(-1, 3)).query(believed.positions)[0] < 0.02).sum() > 200
+    assert (distance < 0.02).sum() < 40
+
+
 def turned(cameras: list[Camera], factor: float) -> list[Camera]:
     """Cameras about the vertical axis, so much further around it."""
     ahead = np.array([camera.rotation[2] for camera in cameras])
