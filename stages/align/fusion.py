@@ -191,11 +191,11 @@ def fuse(
     """Fuse depth maps: confident surfaces once, fill where nothing better is, colours without
     highlights.
 
-    A depth stays unless as many views see through it as agree with it (two of three wide photographs
-    draw the upper incisors too long, over the lower ones that the third one sees). Where views agree, the most
-    confident pixel stays with the depth that all of them say (weighted by confidence - 1) and the
-    weighted median colour; the others are dropped, as in InstantSplat's co-visibility pruning. Fill
-    is dropped wherever a confident surface explains or refutes it.
+    A depth stays unless as many views see through it as agree with it (two of three wide
+    photographs draw the upper incisors too long, over the lower ones that the third one sees).
+    Where views agree, the most confident pixel stays with the depth that all of them say (weighted
+    by confidence - 1) and the weighted median colour; the others are dropped, as in InstantSplat's
+    co-visibility pruning. Fill is dropped wherever a confident surface explains or refutes it.
 
     Args:
         depths: V arrays [H, W] float32 z-depth, 0 where there is none; sizes may differ.
