@@ -121,19 +121,18 @@ def read_landmarks(
     for dentition, camera, depth in zip(dentitions, cameras, depths, strict=True):
         crowns = _numbered(dentition, depth)
         meeting = _meeting_places({crown.number: crown for crown, _ in crowns})
+        from_jaw = {jaw: _distance_from(dentition.crowns(jaw), dentition.size) for jaw in JAWS}
         for crown, covered in crowns:
             edges_seen.setdefault(crown.number, []).append(not covered)
             inside = filled((crown,), dentition.size)
-            clear = inside & ~_beside_other_jaw(crown, dentition) if covered else inside
-            places = _places(crown, covered)
-            if crown.number in meeting:
-                places["mesial"] = meeting[crown.number]
-            for name, pixel in places.items():
-                at_rim = covered and name in ("rim", "edge")
-                sighting = _lift(
-                    crown, pixel, clear if at_rim else inside, camera, depth,
-                    REACH_BEHIND if at_rim else REACH,
-                )  # fmt: skip
+            usual = (inside, REACH)
+            at_rim = usual
+            if covered:
+                apart = from_jaw["lower" if crown.jaw == "upper" else "upper"]
+                at_rim = (inside & (apart >= BESIDE * _height(crown)), REACH_BEHIND)
+            for name, pixel in (_places(crown, covered) | meeting.get(crown.number, {})).items():
+                region = at_rim if name in ("rim", "edge") else usual
+                sighting = _lift(crown, pixel, *region, camera, depth)
                 if sighting is not None:
                     sightings.setdefault((name, crown.number), []).append(sighting)
     joined = {}
@@ -157,6 +156,11 @@ def _numbered(dentition: Dentition, depth: npt.NDArray[np.floating]) -> list[tup
     return [(crown, _covered(crown, dentition, depth)) for crown in largest.values()]
 
 
+def _height(crown: Crown) -> float:
+    """Pixels from the gum to the biting edge."""
+    return float(np.linalg.norm(crown.zenith - crown.tip))
+
+
 def _area(crown: Crown) -> float:
     return float(cv2.contourArea(crown.outline.astype(np.float32)))
 
@@ -174,8 +178,7 @@ def _covered(crown: Crown, dentition: Dentition, depth: npt.NDArray[np.floating]
 
 def _along_edge(crown: Crown) -> list[Array]:
     """Pixels [2] where a crown's outline ends towards the other jaw: amid it, and to both sides."""
-    height = max(float(np.linalg.norm(crown.tip - crown.zenith)), 1e-9)
-    down = (crown.tip - crown.zenith) / height
+    down = (crown.tip - crown.zenith) / max(_height(crown), 1e-9)
     outline = np.asarray(crown.outline, np.float64).reshape(-1, 2)
     from_centre = outline - crown.centre
     along, across = from_centre @ down, from_centre @ np.array([-down[1], down[0]])
@@ -188,7 +191,7 @@ def _covered_at(
     place: Array, crown: Crown, dentition: Dentition, depth: npt.NDArray[np.floating]
 ) -> bool:
     """Does a crown of the other jaw begin at a pixel [2], that may be nearer to the camera?"""
-    height = float(np.linalg.norm(crown.zenith - crown.tip))
+    height = _height(crown)
     others = dentition.crowns("lower" if crown.jaw == "upper" else "upper")
     for other in others:
         if len(other.outline) < 3:
@@ -196,7 +199,7 @@ def _covered_at(
         gap = -cv2.pointPolygonTest(
             other.outline.astype(np.float32), tuple(map(float, place)), True
         )
-        if gap > TOUCHING * max(height, float(np.linalg.norm(other.zenith - other.tip))):
+        if gap > TOUCHING * max(height, _height(other)):
             continue
         mine = _depth_near(place, height * REACH, filled((crown,), dentition.size), depth)
         theirs = _depth_near(place, height * 0.3, filled((other,), dentition.size), depth)
@@ -216,9 +219,9 @@ def _places(crown: Crown, covered: bool) -> dict[Name, Array]:
     return found
 
 
-def _meeting_places(crowns: Mapping[int, Crown]) -> dict[int, Array]:
+def _meeting_places(crowns: Mapping[int, Crown]) -> dict[int, dict[Name, Array]]:
     """Central incisor -> pixel [2] where it meets that of the other side, or is nearest to it."""
-    found = {}
+    found: dict[int, dict[Name, Array]] = {}
     for jaw in JAWS:
         sides: tuple[list[Crown], list[Crown]] = ([], [])
         for number, crown in crowns.items():
@@ -226,7 +229,7 @@ def _meeting_places(crowns: Mapping[int, Crown]) -> dict[int, Array]:
                 sides[is_left(number)].append(crown)
         if all(sides):
             right, left = (side[0] for side in sides)
-            found[right.number] = found[left.number] = _between(right, left)
+            found[right.number] = found[left.number] = {"mesial": _between(right, left)}
     return found
 
 
@@ -269,19 +272,23 @@ def _window(pixel: Array, reach: float, shape: tuple[int, ...]) -> tuple[slice, 
     return slice(low[1], max(high[1], low[1])), slice(low[0], max(high[0], low[0]))
 
 
-def _beside_other_jaw(crown: Crown, dentition: Dentition) -> Bools:
-    """[H, W] bool: next to the crowns of the other jaw, whose depth the scene may show there."""
-    height = float(np.linalg.norm(crown.zenith - crown.tip))
-    others = dentition.crowns("lower" if crown.jaw == "upper" else "upper")
-    free = 1 - filled(others, dentition.size).astype(np.uint8)
-    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) < BESIDE * height)
+def _distance_from(crowns: tuple[Crown, ...], size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """[H, W] pixels to the nearest of some crowns."""
+    free = (~filled(crowns, size)).astype(np.uint8)
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5), np.float32)
 
 
 def _lift(
-    crown: Crown, pixel: Array, inside: Bools, camera: Camera,
-    depth: npt.NDArray[np.floating], reach: float,
+    crown: Crown, pixel: Array, inside: Bools, reach: float, camera: Camera,
+    depth: npt.NDArray[np.floating],
 ) -> Sighting | None:  # fmt: skip
-    height = float(np.linalg.norm(crown.zenith - crown.tip))
+    """A landmark in one photograph; None: nothing is known of the depth there.
+
+    Args:
+        inside, reach: the pixels that depth is taken from, and how far from the landmark, as a
+            share of the crown's height.
+    """
+    height = _height(crown)
     z = _depth_near(pixel, reach * height, inside, depth)
     if z is None:
         return None
