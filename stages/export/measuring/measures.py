@@ -63,7 +63,7 @@ class Rule:
         measure: places and the mouth's axes [3, 3] (rows left, up, out) -> the value and the two
             points [2, 3] that it is drawn between.
         stands_for: how well what is seen stands for what is meant, a standard deviation as share
-            of the size of a tooth: from generated mouths, whose crowns are known.
+            of the size of a tooth: from generated mouths, whose crowns are known, in whole runs.
         signs: what a positive and a negative value are called, where there is a sign.
         covered: times less sure where the other jaw covers the edge it is measured at.
         estimate: what to estimate it at where it can't be measured, or why not; see `covered_bite`.
@@ -350,7 +350,7 @@ RULES = (
     Rule(
         "overbite", "Overbite",
         "how far the upper central incisors reach over the edges of the lower ones",
-        (("tip", (11, 21)), ("tip", (31, 41))), _overbite, 0.04, ("", "open"),
+        (("tip", (11, 21)), ("tip", (31, 41))), _overbite, 0.08, ("", "open"),
         estimate=covered_bite,
     ),
     Rule(
