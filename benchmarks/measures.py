@@ -26,6 +26,8 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples and tests
 
+from mouths import ARCH_POWERS, ARCH_WIDTH, ARCH_WIDTH_SPREAD
+
 from data_samples.mouths import photograph, random_mouth
 from data_samples.mouths.cameras import Camera, look
 from data_samples.mouths.visits import CALM
@@ -35,8 +37,6 @@ Array = npt.NDArray[np.float64]
 BITES, SHARES = ("normal", "deep", "overjet", "edge"), (0.5, 0.2, 0.2, 0.1)
 ROLES = (("right", -44.0), ("front", 0.0), ("left", 44.0))
 SIZE = (640, 480)
-#: As in `mouths.py`: arches as wide and as deep as people's.
-ARCH_WIDTH, ARCH_WIDTH_SPREAD, ARCH_POWERS = 1.04, 0.06, (2.5, 3.3)
 #: Crowns as a whole are taller or lower by this standard deviation.
 CROWN_HEIGHTS = 0.09
 SETTINGS = (

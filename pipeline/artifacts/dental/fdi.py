@@ -19,6 +19,11 @@ ALL_TEETH = frozenset(
 _PRIMARY_LETTERS = "ABCDEFGHIJKLMNOPQRST"
 
 
+def other_jaw(jaw: Jaw) -> Jaw:
+    """The jaw that bites on this one."""
+    return "lower" if jaw == "upper" else "upper"
+
+
 def teeth_of(jaw: Jaw) -> tuple[int, ...]:
     """FDI numbers of a jaw's permanent teeth from the patient's right to the patient's left."""
     return UPPER_TEETH if jaw == "upper" else LOWER_TEETH

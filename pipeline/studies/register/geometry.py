@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 TRIES, SAMPLE = 400, 4
 #: A tooth agrees with a frame if its centre is met within this, mm.
 NEAR = 1.2
-#: Two visits of a patient differ at most so much in scale (each may be off by 15 %).
+#: Two visits of a patient differ at most so much in scale (each may be off by 10 % and more).
 MOST_SCALE = 1.4
 #: Points of a crown that are laid on, and those they are laid onto.
 POINTS, TARGET = 500, 6000

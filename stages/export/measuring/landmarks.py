@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import JAWS, is_left, is_upper
+from pipeline.artifacts.dental.fdi import JAWS, is_left, is_upper, other_jaw
 from pipeline.artifacts.teeth import Crown, Dentition, filled
 
 Array = npt.NDArray[np.float64]
@@ -128,7 +128,7 @@ def read_landmarks(
             usual = (inside, REACH)
             at_rim = usual
             if covered:
-                apart = from_jaw["lower" if crown.jaw == "upper" else "upper"]
+                apart = from_jaw[other_jaw(crown.jaw)]
                 at_rim = (inside & (apart >= BESIDE * _height(crown)), REACH_BEHIND)
             for name, pixel in (_places(crown, covered) | meeting.get(crown.number, {})).items():
                 region = at_rim if name in ("rim", "edge") else usual
@@ -192,7 +192,7 @@ def _covered_at(
 ) -> bool:
     """Does a crown of the other jaw begin at a pixel [2], that may be nearer to the camera?"""
     height = _height(crown)
-    others = dentition.crowns("lower" if crown.jaw == "upper" else "upper")
+    others = dentition.crowns(other_jaw(crown.jaw))
     for other in others:
         if len(other.outline) < 3:
             continue

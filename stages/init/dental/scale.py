@@ -10,6 +10,7 @@ from pipeline.artifacts.dental.fdi import teeth_of
 from pipeline.errors import RequestError
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit
+from stages.init.mouth import TEXTBOOK_DEVIATION
 
 #: Relative standard deviation of a crown's width as it comes out between its landmarks.
 WIDTH_DEVIATION = 0.04
@@ -43,7 +44,7 @@ def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float,
         RequestError: none of these teeth was seen with both its neighbours.
     """
     if not widths:
-        return 1.0, fit.scale_uncertainty
+        return 1.0, TEXTBOOK_DEVIATION
     ratios = {
         tooth: known / measured
         for tooth, known in sorted(widths.items())

@@ -56,7 +56,6 @@ class ArchFit:
         margin: by how much the labelling chosen is better than the next one that matches the
             photographs to each other otherwise (twice the log evidence).
         doubts: sentences for the user why the result should not be trusted; empty: trust it.
-        scale_uncertainty: relative standard deviation of the millimetres.
         figures: what the doubts rest on.
         confidence: 0..1, how far the numbers and the cameras can be trusted; doubts say why not
             where it is below .5.
@@ -69,7 +68,6 @@ class ArchFit:
     shape: dict[Landmark, Array]
     margin: float
     doubts: tuple[str, ...] = ()
-    scale_uncertainty: float = 0.1
     figures: dict[str, float] = field(default_factory=dict)
     primary: frozenset[int] = frozenset()
     confidence: float = 0.0

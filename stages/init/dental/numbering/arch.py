@@ -70,8 +70,6 @@ EDITED, EDIT_WINDOW = 3, 40.0
 SHIFTS, EDIT_GAP = 3, 30.0
 #: How far away known cameras are, they say themselves: hardly any prior (relative deviation).
 HELD_DISTANCE_DEVIATION = 0.5
-#: The millimetres rest on the size of a textbook arch: relative standard deviation.
-SCALE_UNCERTAINTY = 0.1
 
 
 def fit_arch(
@@ -366,7 +364,6 @@ def _outcome(
         shape=shape,
         margin=float(gap),
         doubts=tuple(doubts),
-        scale_uncertainty=SCALE_UNCERTAINTY,
         figures=figures,
         primary=labelling.primary,
         confidence=case_confidence(figures, bool(doubts), scorer.options),

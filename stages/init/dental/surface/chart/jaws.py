@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.fdi import Jaw, is_upper, other_jaw, teeth_of
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.solution import ArchFit
 from stages.init.dental.surface.chart.crown_shape import (
@@ -148,7 +148,7 @@ def nearest_depths(
         depths = []
         for jaw, points, used in meshes:
             depth = raster_chart(photo, points, used)[0]
-            other: Jaw = "lower" if jaw == "upper" else "upper"
+            other = other_jaw(jaw)
             depth[(photo.tooth_of(other) > 0) | (photo.gum_of(other) > 0)] = 0
             depths.append(depth)
         return nearest_of(depths)
