@@ -1,11 +1,14 @@
 """What an orthodontist measures, from whole runs: how far off, and is that said?
 
-    python benchmarks/measures.py [--mouths 20] [--first 700] [--jobs 2] [--out DIR]
+    python benchmarks/measures.py [--mouths 20] [--first 700] [--views 3] [--jobs 2] [--out DIR]
+                                  [--dentition permanent|primary|mixed]
 
-Grows adults' mouths with all sorts of bites, takes three photographs of each, 44 degrees apart, in
-one light and through one lens, runs the stages on them at 512 px, and compares the measurements of
-`teeth.json` with the crowns' own meshes. Beside them, scale: the size of things in the scene over
-their true one. OUT keeps photographs and workspaces, which makes the next run quicker.
+Grows mouths with all sorts of bites, takes three photographs of each, 44 degrees apart, in one
+light and through one lens (or --views of a film from side to side), runs the stages on them at
+512 px, and compares the measurements of `teeth.json` with the crowns' own meshes. Beside them,
+scale: the size of things in the scene over their true one; and surface: how far the crowns in the
+scene lie from the true ones after one similarity (over all that the photographs show of them). OUT
+keeps photographs and workspaces, which makes the next run quicker.
 """
 
 from __future__ import annotations
@@ -30,12 +33,14 @@ from mouths import ARCH_POWERS, ARCH_WIDTH, ARCH_WIDTH_SPREAD
 
 from data_samples.mouths import photograph, random_mouth
 from data_samples.mouths.cameras import Camera, look
+from data_samples.mouths.options import DENTITIONS
 from data_samples.mouths.visits import CALM
 from tests.stages.measured_mouth import truth
 
 Array = npt.NDArray[np.float64]
 BITES, SHARES = ("normal", "deep", "overjet", "edge"), (0.5, 0.2, 0.2, 0.1)
-ROLES = (("right", -44.0), ("front", 0.0), ("left", 44.0))
+#: Degrees from the patient's left of the first and last photograph: three, and of a film.
+REACH, FILM_REACH = 44.0, 50.0
 SIZE = (640, 480)
 #: Crowns as a whole are taller or lower by this standard deviation.
 CROWN_HEIGHTS = 0.09
@@ -44,15 +49,15 @@ SETTINGS = (
 )  # fmt: skip
 
 
-def make_photographs(folder: Path, seed: int) -> None:
-    """Three photographs of a mouth, and in `truth/` what is true of it and them; once."""
+def make_photographs(folder: Path, seed: int, views: int, dentition: str) -> None:
+    """Photographs of a mouth, and in `truth/` what is true of it and them; once."""
     if (folder / "truth" / "truth.json").exists():
         return
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     form = np.random.default_rng([6, seed])
     mouth = random_mouth(
         np.random.default_rng([3, seed]),
-        **CALM | {"bite": str(form.choice(BITES, p=SHARES))},
+        **CALM | {"bite": str(form.choice(BITES, p=SHARES)), "dentition": dentition},
         arch_width=float(form.normal(ARCH_WIDTH, ARCH_WIDTH_SPREAD)),
         arch_power=float(form.uniform(*ARCH_POWERS)),
         crown_height=float(np.exp(CROWN_HEIGHTS * form.normal())),
@@ -62,25 +67,29 @@ def make_photographs(folder: Path, seed: int) -> None:
     pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     width, height = SIZE
     focal = 1.9 * width * float(rng.uniform(0.95, 1.1))
-    for number, (role, yaw) in enumerate(ROLES):
+    reach = REACH if views == 3 else FILM_REACH
+    for number, yaw in enumerate(np.linspace(-reach, reach, views)):
         turned, tilt, roll = rng.normal(size=3) * (3.0, 2.0, 3.0)
-        pose = look(yaw + float(turned), 4.0 + float(tilt), float(roll), 125.0, pivot)
+        pose = look(float(yaw + turned), 4.0 + float(tilt), float(roll), 125.0, pivot)
         camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
+        role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
         photo = photograph(
             mouth, rng, role, width=width, height=height, bite="closed", camera=camera, plain=True
         )
-        cv2.imwrite(str(folder / f"{number}_{role}.jpg"), photo.image[..., ::-1])
+        name = f"{number}_{role}" if views == 3 else f"{number:03d}"
+        cv2.imwrite(str(folder / f"{name}.jpg"), photo.image[..., ::-1])
         np.savez_compressed(
-            folder / "truth" / f"{number}.npz",
-            millimetres=np.where(photo.labels > 0, photo.depth / focal * width, 0),
-        )
+            folder / "truth" / f"{number}.npz", depth=np.where(photo.labels > 0, photo.depth, 0),
+            focal=focal, pose=pose,
+        )  # fmt: skip
     (folder / "truth" / "truth.json").write_text(json.dumps(truth(mouth)))
 
 
-def run(out: Path, seed: int) -> list[dict[str, Any]] | None:
+def run(out: Path, views: int, dentition: str, seed: int) -> dict[str, Any] | None:
     """The measurements of one mouth, each with what is true; None if it was refused."""
-    photographs, workspace = out / "photographs" / str(seed), out / "workspaces" / str(seed)
-    make_photographs(photographs, seed)
+    name = f"{seed}_{views}_{dentition}"
+    photographs, workspace = out / "photographs" / name, out / "workspaces" / name
+    make_photographs(photographs, seed, views, dentition)
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     subprocess.run(
         ["pipeline", "run", str(photographs), "-w", str(workspace), "-q", *settings], check=False,
@@ -91,13 +100,16 @@ def run(out: Path, seed: int) -> list[dict[str, Any]] | None:
         return None
     true = json.loads((photographs / "truth" / "truth.json").read_text())
     found = json.loads(file.read_text())["measurements"]
-    scale = enlarged(workspace, photographs)
-    return [{**entry, "true": true[entry["name"]], "seed": seed, "scale": scale} for entry in found]
+    scale, surface = compare_crowns(workspace, photographs)
+    entries = [e | {"true": true[e["name"]]} for e in found if e["name"] in true]
+    return {"seed": seed, "entries": entries, "scale": scale, "surface": surface}
 
 
-def enlarged(workspace: Path, photographs: Path) -> float:
-    """Size of the crowns in the scene over their true one."""
+def compare_crowns(workspace: Path, photographs: Path) -> tuple[float, list[float]]:
+    """Size of the crowns in the scene over their true one, and how far they are from the true ones
+    after one similarity: mm, median and 90 % of what the photographs show."""
     from pipeline.artifacts.space.frames import frame_of
+    from pipeline.geometry.similarity import robust_similarity
     from pipeline.studies.report.reading import read_case
     from stages.splatting.frame import move_cameras, move_gaussians
     from stages.splatting.rendering import render
@@ -107,14 +119,27 @@ def enlarged(workspace: Path, photographs: Path) -> float:
     assert cameras is not None and gaussians is not None
     frame = frame_of(cameras, "auto").from_world
     gaussians = move_gaussians(gaussians, frame)
-    ratios = []
-    for number, camera in enumerate(move_cameras(cameras.cameras, frame)):
+    ratios, scene, truths = [], [], []
+    for camera in move_cameras(cameras.cameras, frame):
         view = render(gaussians, camera, threads=1)
-        true = np.load(photographs / "truth" / f"{number}.npz")["millimetres"]
-        true = cv2.resize(true, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
-        known = (view.alpha > 0.9) & (true > 0)
-        ratios.append(np.median((view.depth / camera.fx * camera.width)[known] / true[known]))
-    return float(np.mean(ratios))
+        true = np.load(photographs / "truth" / f"{int(camera.name)}.npz")
+        size = camera.width, camera.height
+        depth = cv2.resize(true["depth"], size, interpolation=cv2.INTER_NEAREST)
+        focal = float(true["focal"]) * camera.width / SIZE[0]
+        known = (view.alpha > 0.9) & (depth > 0)
+        ratios.append(np.median((view.depth / camera.fx * focal)[known] / depth[known]))
+        v, u = (a[known] + 0.5 for a in np.indices(known.shape))
+        found = np.column_stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 0 * u + 1]
+        )
+        scene.append((found * view.depth[known][:, None] - camera.translation) @ camera.rotation)
+        seen = np.column_stack([(u - size[0] / 2) / focal, (v - size[1] / 2) / focal, 0 * u + 1])
+        pose = true["pose"]
+        truths.append((seen * depth[known][:, None] - pose[:3, 3]) @ pose[:3, :3])
+    points, theirs = np.concatenate(scene), np.concatenate(truths)
+    size_of_it, turn, shift = robust_similarity(points, theirs, np.ones(len(points)))
+    off = np.linalg.norm(theirs - size_of_it * points @ turn.T - shift, axis=1)
+    return float(np.mean(ratios)), np.quantile(off, [0.5, 0.9]).tolist()
 
 
 def describe(name: str, entries: list[dict[str, Any]]) -> str:
@@ -132,14 +157,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mouths", type=int, default=20)
     parser.add_argument("--first", type=int, default=700)
+    parser.add_argument("--views", type=int, default=3, help="3, or as many as a film has")
+    parser.add_argument("--dentition", choices=DENTITIONS, default="permanent")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(args.jobs) as jobs:
         seeds = range(args.first, args.first + args.mouths)
-        results = list(jobs.map(partial(run, args.out or Path(scratch)), seeds))
-    entries = [entry for result in results if result is not None for entry in result]
-    print(f"scenes: {sum(result is not None for result in results)} of {args.mouths}")
+        one = partial(run, args.out or Path(scratch), args.views, args.dentition)
+        scenes = [scene for scene in jobs.map(one, seeds) if scene is not None]
+    print(f"scenes: {len(scenes)} of {args.mouths}")
+    entries = [entry for scene in scenes for entry in scene["entries"]]
     for name in dict.fromkeys(entry["name"] for entry in entries):
         mine = [entry for entry in entries if entry["name"] == name]
         measured = [e for e in mine if e["value"] is not None and not e["estimated"]]
@@ -147,8 +175,11 @@ def main() -> None:
         for label, part in ((name, measured), (f"{name}, estimated", estimated)):
             if part:
                 print(describe(label, part))
-    scales = np.log([result[0]["scale"] for result in results if result])
+    scales = np.log([scene["scale"] for scene in scenes])
     print(f"scale: {100 * scales.mean():+.1f} % on average, +- {100 * scales.std():.1f} %")
+    surfaces = np.array([scene["surface"] for scene in scenes])
+    middle, most = np.median(surfaces, axis=0)
+    print(f"surface: off by {middle:.2f} mm in the median, 90 % of it by at most {most:.2f}")
 
 
 if __name__ == "__main__":

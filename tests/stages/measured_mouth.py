@@ -13,8 +13,10 @@ from data_samples.mouths.cameras import Camera as TrueCamera
 from data_samples.mouths.cameras import look
 from data_samples.mouths.rays import cast, ray_scene
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.dental.fdi import is_left, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, filled
 from stages.dentition.crowns import dentition_of
+from stages.export.measuring.places import with_primary
 from tests.stages.mouth_case import outlines_of
 
 WIDTH, HEIGHT = 640, 480
@@ -62,38 +64,48 @@ def numbered(read: Dentition, labels: np.ndarray) -> Dentition:
 
 
 def truth(mouth: Mouth) -> dict[str, float]:
-    """The same values from the crowns' own meshes (mm; x left, y up, z out)."""
+    """The same values from the crowns' own meshes (mm; x left, y up, z out), where there are the
+    teeth for them: permanent, or the primary ones that stand in their places."""
     teeth = {tooth.plan.fdi: tooth for tooth in mouth.teeth}
 
     def tip(n: int) -> np.ndarray:
         """Middle of the biting edge, where it turns into the outer face."""
         tooth = teeth[n]
-        ends = tooth.vertices[:, 1] * (1 if n > 30 else -1)
+        ends = tooth.vertices[:, 1] * (-1 if is_upper(n) else 1)
         edge = tooth.vertices[ends >= ends.max() - 0.5]
         out = edge @ tooth.outward
         return edge[out >= out.max() - 0.2].mean(0)
 
     def face(n: int, height: float) -> float:
-        """How far out the outer face reaches at a height."""
+        """How far out the outer face of a lower tooth reaches at a height, or at its edge."""
         v = teeth[n].vertices
+        height = min(height, v[:, 1].max() - 0.4)
         return float(v[abs(v[:, 1] - height) < 0.4][:, 2].max())
 
-    def meet(right: int, left: int) -> float:
+    def meet(pair: list[int]) -> float:
         ends = []
-        for n, side in ((right, 1), (left, -1)):
-            tooth = teeth[n]
+        for n in pair:
+            tooth, side = teeth[n], -1 if is_left(n) else 1
             low = tooth.vertices[tooth.local[:, 1] < 0.35 * tooth.plan.height]
             ends.append(side * (side * low[:, 0]).max())
         return float(np.mean(ends))
 
-    above, below = (np.mean([tip(a), tip(b)], axis=0) for a, b in ((11, 21), (31, 41)))
-    level = min(above[1], below[1])
-    return {
-        "overjet": above[2] - float(np.mean([face(n, level - 0.4) for n in (31, 41)])),
-        "overbite": below[1] - above[1],
-        "midline_shift": meet(41, 31) - meet(11, 21),
-        "intercanine_upper": float(np.linalg.norm(tip(13) - tip(23))),
-        "intercanine_lower": float(np.linalg.norm(tip(43) - tip(33))),
-        "intermolar_upper": float(np.linalg.norm(teeth[16].labial - teeth[26].labial)),
-        "intermolar_lower": float(np.linalg.norm(teeth[46].labial - teeth[36].labial)),
-    }
+    def there(*group: int) -> list[int]:
+        return [m for n in group for m in with_primary((n,)) if m in teeth]
+
+    values = {}
+    upper, lower = there(11, 21), there(31, 41)
+    if upper and lower:
+        above, below = (np.mean([tip(n) for n in pair], axis=0) for pair in (upper, lower))
+        level = min(above[1], below[1])
+        values["overjet"] = above[2] - float(np.mean([face(n, level - 0.4) for n in lower]))
+        values["overbite"] = below[1] - above[1]
+        if len(upper) == len(lower) == 2:
+            values["midline_shift"] = meet(lower) - meet(upper)
+    for name, canines, molars in (("upper", (13, 23), (16, 26)), ("lower", (43, 33), (46, 36))):
+        if len(pair := there(*canines)) == 2:
+            values[f"intercanine_{name}"] = float(np.linalg.norm(tip(pair[0]) - tip(pair[1])))
+        if len(pair := there(*molars)) == 2:
+            ends = [teeth[n].labial for n in pair]
+            values[f"intermolar_{name}"] = float(np.linalg.norm(ends[0] - ends[1]))
+    return values
