@@ -23,10 +23,10 @@ Array = npt.NDArray[np.float64]
 ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (30.5, 46.0), "lower": (28.0, 43.0)}
 #: The same where all teeth before the molars are primary; it ends behind the first molars, seen or
 #: not. A child's arch is deeper for its width than the front of an adult's: between the edges of
-#: primary canines, of second molars, and from incisors back to these it is 29, 43 and 21 mm above,
-#: 23, 40 and 19 below. The shape is between what four children's photographs make likeliest
-#: (shallower by a tenth) and casts of children (deeper by as much); either is less likely by 5 and
-#: by 10 (twice the log evidence of the four), the front of an adult's arch by 8.
+#: primary canines, of second molars, and from incisors back to these it is 29, 43 and 20 mm above,
+#: 22, 39 and 17 below. The shape is between what four children's photographs make likeliest
+#: (shallower by a twentieth) and casts of children (deeper by as much). Twice the log evidence of
+#: the four is better by 5 and worse by 5 there; on the front of an adult's arch it is worse by 8.
 PRIMARY_ARCH_SIZE: dict[Jaw, tuple[float, float]] = {"upper": (25.8, 36.1), "lower": (24.8, 34.7)}
 #: How far the lower incisors reach up behind the upper ones, and lie behind them (mm).
 OVERBITE, OVERJET = 2.5, 2.2
@@ -81,7 +81,7 @@ def is_lower_landmark() -> npt.NDArray[np.bool_]:
     return np.arange(2 * LANDMARKS_A_JAW) >= LANDMARKS_A_JAW
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _arch_curve(half_width: float, depth: float, length: float) -> tuple[Array, Array, Array]:
     """Arc length, x and z of half an arch from the midline backwards, [4001] each.
 
