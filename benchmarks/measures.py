@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples and
 from mouths import ARCH_POWERS, ARCH_WIDTH, ARCH_WIDTH_SPREAD
 
 from data_samples.mouths import photograph, random_mouth
-from data_samples.mouths.cameras import Camera, look
+from data_samples.mouths.cameras import Camera, look, role_at
 from data_samples.mouths.options import DENTITIONS
 from data_samples.mouths.visits import CALM
 from tests.stages.measured_mouth import truth
@@ -72,7 +72,7 @@ def make_photographs(folder: Path, seed: int, views: int, dentition: str) -> Non
         turned, tilt, roll = rng.normal(size=3) * (3.0, 2.0, 3.0)
         pose = look(float(yaw + turned), 4.0 + float(tilt), float(roll), 125.0, pivot)
         camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
-        role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
+        role = role_at(float(yaw))
         photo = photograph(
             mouth, rng, role, width=width, height=height, bite="closed", camera=camera, plain=True
         )
@@ -108,6 +108,7 @@ def run(out: Path, views: int, dentition: str, seed: int) -> dict[str, Any] | No
 def compare_crowns(workspace: Path, photographs: Path) -> tuple[float, list[float]]:
     """Size of the crowns in the scene over their true one, and how far they are from the true ones
     after one similarity: mm, median and 90 % of what the photographs show."""
+    from pipeline.artifacts.cameras import Camera as PlacedCamera
     from pipeline.artifacts.space.frames import frame_of
     from pipeline.geometry.similarity import robust_similarity
     from pipeline.studies.report.reading import read_case
@@ -126,16 +127,13 @@ def compare_crowns(workspace: Path, photographs: Path) -> tuple[float, list[floa
         size = camera.width, camera.height
         depth = cv2.resize(true["depth"], size, interpolation=cv2.INTER_NEAREST)
         focal = float(true["focal"]) * camera.width / SIZE[0]
+        true_camera = PlacedCamera(
+            camera.name, *size, focal, focal, size[0] / 2, size[1] / 2, true["pose"]
+        )
         known = (view.alpha > 0.9) & (depth > 0)
         ratios.append(np.median((view.depth / camera.fx * focal)[known] / depth[known]))
-        v, u = (a[known] + 0.5 for a in np.indices(known.shape))
-        found = np.column_stack(
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 0 * u + 1]
-        )
-        scene.append((found * view.depth[known][:, None] - camera.translation) @ camera.rotation)
-        seen = np.column_stack([(u - size[0] / 2) / focal, (v - size[1] / 2) / focal, 0 * u + 1])
-        pose = true["pose"]
-        truths.append((seen * depth[known][:, None] - pose[:3, 3]) @ pose[:3, :3])
+        scene.append(camera.unproject(view.depth)[known])
+        truths.append(true_camera.unproject(depth)[known])
     points, theirs = np.concatenate(scene), np.concatenate(truths)
     size_of_it, turn, shift = robust_similarity(points, theirs, np.ones(len(points)))
     off = np.linalg.norm(theirs - size_of_it * points @ turn.T - shift, axis=1)

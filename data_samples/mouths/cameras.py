@@ -12,6 +12,8 @@ from .mouth import Mouth
 
 Array = npt.NDArray[np.float64]
 ROLES = ("front", "right", "left", "upper", "lower")
+#: Degrees from the front beyond which a photograph is one of a side.
+SIDEWAYS = 20.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,13 @@ class Camera:
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         origin = np.broadcast_to(-rotation.T @ translation, local.shape)
         return np.concatenate([origin, local @ rotation], -1).astype(np.float32)
+
+
+def role_at(yaw: float) -> str:
+    """Role of a photograph taken so many degrees from the front, the patient's left positive."""
+    if yaw < -SIDEWAYS:
+        return "right"
+    return "left" if yaw >= SIDEWAYS else "front"
 
 
 def look(yaw: float, elevation: float, roll: float, distance: float, pivot: Array) -> Array:

@@ -22,7 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .cameras import Camera, look
+from .cameras import Camera, look, role_at
 from .mouth import Mouth, build_mouth
 from .moves import Move, axes_of, motion_of
 from .options import random_options
@@ -112,10 +112,9 @@ def sweep(
     end = float(rng.uniform(*reach)) if reach[0] < reach[1] else reach[0]
     for yaw in np.linspace(-end, end, views):
         camera = _camera(mouth, yaw, distance, side * distance / 125, width, rng)
-        role = ("right", "front", "left")[int(np.digitize(yaw, (-20, 20)))]
         yield photograph(
-            mouth, rng, role, width=camera.width, height=camera.height, bite="closed",
-            camera=camera, plain=plain,
+            mouth, rng, role_at(float(yaw)), width=camera.width, height=camera.height,
+            bite="closed", camera=camera, plain=plain,
         )  # fmt: skip
 
 

@@ -264,8 +264,9 @@ def _papilla(first: _Local, second: _Local, band: float) -> Array | None:
     """(along, gumward) where two neighbours meet below the gum: nearest to it, as near to each
     other as `MEETING`; or where they are nearest.
 
-    Crowns that overlap in the picture meet in a corner. Where they just miss each other there is
-    none, and the lowest place of their common outline would be where they are widest.
+    Crowns that overlap in the picture meet in a corner, but their sides are nearly parallel there,
+    and it slides along them with every pixel of overlap, down to where the crowns are widest. A
+    little further up the sides part quickly.
 
     Args:
         first, second: their outlines, left and right.

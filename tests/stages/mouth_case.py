@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from data_samples.mouths import Mouth, Photograph, photograph, random_mouth
-from data_samples.mouths.cameras import Camera, look
+from data_samples.mouths.cameras import Camera, look, role_at
 from pipeline.artifacts.dental.fdi import (
     JAWS,
     is_left,
@@ -31,7 +31,6 @@ from pipeline.geometry.rigid import angle_between
 from stages.dentition.crowns import Outline, dentition_of
 
 WIDTH, HEIGHT = 512, 384
-ROLES = ("right", "front", "left")
 #: A wrong number is none if this much doubt is said beside it.
 DOUBTED = 0.05
 #: A textbook mouth where nothing else is said: nobody's, but without the generator's rarities.
@@ -120,7 +119,7 @@ def mouth_case(
     pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     photos = []
     for yaw, roll in zip(yaws, rolls, strict=True):
-        role = ROLES[int(np.digitize(yaw, (-20, 20)))]
+        role = role_at(yaw)
         focal = side * WIDTH
         view = look(yaw, 4.0, roll, distance, pivot)
         camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, view)

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.dental.fdi import JAWS, Jaw, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
 from stages.init.dental.cameras import kernels
 from stages.init.dental.cameras.bundle import nominal_rotation
 from stages.init.dental.numbering.arch import ArchOptions
+from stages.init.dental.numbering.primary import ALL_PRIMARY
 from stages.init.dental.template import (
     EMBRASURE,
     PAPILLA,
@@ -86,8 +87,7 @@ def test_primary_teeth_are_smaller_and_the_rest_moves_up() -> None:
 
 def test_a_childs_arch_is_narrower_and_deeper_for_its_width() -> None:
     """Between the edges of canines and of what stands before the molars, and back to these, mm."""
-    everything = frozenset(t for jaw in JAWS for t in teeth_of(jaw) if t % 10 <= 5)
-    behind_incisors = frozenset(t for t in everything if t % 10 >= 3)
+    behind_incisors = frozenset(t for t in ALL_PRIMARY if t % 10 >= 3)
 
     def extent(points: np.ndarray, jaw: Jaw) -> tuple[float, float, float]:
         first, third, fifth = (
@@ -98,16 +98,16 @@ def test_a_childs_arch_is_narrower_and_deeper_for_its_width() -> None:
     for jaw in JAWS:
         childs, changing, adults = (
             extent(textbook_arch(frozenset(), primary), jaw)
-            for primary in (everything, behind_incisors, frozenset())
+            for primary in (ALL_PRIMARY, behind_incisors, frozenset())
         )
         assert childs[0] < changing[0] < adults[0]
         assert childs[2] / childs[1] > 1.04 * adults[2] / adults[1]
         assert changing[2] / changing[1] > 1.04 * adults[2] / adults[1]
-    assert extent(textbook_arch(frozenset(), everything), "upper") == pytest.approx(
+    assert extent(textbook_arch(frozenset(), ALL_PRIMARY), "upper") == pytest.approx(
         (28.5, 42.5, 20.5), abs=0.6
     )
     # All of it is the curve's: nothing lies on one spot behind its end.
-    points = textbook_arch(frozenset(), everything)
+    points = textbook_arch(frozenset(), ALL_PRIMARY)
     back = points[landmark_index("upper", TIP, POSITIONS - 2) :][:2]
     assert np.linalg.norm(back[1] - back[0]) > 5.0
 

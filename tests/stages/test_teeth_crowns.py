@@ -142,6 +142,26 @@ def test_across_a_gap_there_is_no_papilla() -> None:
     np.testing.assert_array_equal(narrow[2].papilla_right, narrow[3].papilla_left)
 
 
+def test_papillae_hardly_move_with_how_far_round_crowns_overlap() -> None:
+    """In one photograph neighbours touch, in another one covers some of the other."""
+    round_ = np.stack([f(np.linspace(0, 2 * np.pi, 400)) for f in (np.cos, np.sin)], 1)
+
+    def height(apart: float) -> float:
+        """Of the papilla above the middle of round crowns, upwards."""
+        outlines = [
+            Outline(round_ * (22, 35) + MIDDLE + (k * (44 + apart), 36 * up), jaw)
+            for jaw, up in (("upper", -1), ("lower", 1))
+            for k in (-1, 0, 1)
+        ]
+        crown = read(outlines).upper[1]
+        assert crown.papilla_left is not None
+        return float(MIDDLE[1] - 36 - crown.papilla_left[1])
+
+    touching, overlapping = height(0.0), height(-4.0)
+    assert 8 < touching < 35, "above where they are widest"
+    assert 0 < overlapping - touching < 8, "the corner of their outlines moves by 15"
+
+
 def test_jaws_apart_are_measured() -> None:
     assert read(mouth(apart=28.0)).jaws_apart == pytest.approx(28 / 140, abs=0.03)
     deep = read(mouth(apart=-30.0))

@@ -35,6 +35,7 @@ OVERBITE, OVERJET = 2.5, 2.2
 GUM_STEPS = ((4.0, 0.8), (9.0, -0.5))
 #: Teeth a side, without wisdom teeth.
 TEETH_A_SIDE = 7
+#: Of a jaw's teeth so many on either side are primary before they change.
 PRIMARY_TEETH_A_SIDE = 5
 #: The curve goes on so far (mm) as a straight line.
 STRAIGHT_ON = 30.0
