@@ -18,7 +18,8 @@ from pipeline.artifacts.dental.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
-from stages.dentition.crowns import dentition_of, mirrored_dentition, outline_of
+from stages.dentition.crowns import centroid, dentition_of, mirrored_dentition, outline_of
+from stages.dentition.parts import perhaps_one
 
 Array = npt.NDArray[np.float64]
 
@@ -138,14 +139,30 @@ def _change(
     start, end = (working_place(view, place) for place in change.split)
     parts = split_polygon(crown.outline, start, end)
     areas = [area(part) for part in parts]
-    if min(areas) < LEAST_PART * max(sum(areas), 1e-9):
+    unknown = replace(crown, number=0, doubt=1.0, numbers={})
+    if min(areas) >= LEAST_PART * max(sum(areas), 1e-9):
+        crowns[index : index + 1] = [replace(unknown, outline=part) for part in parts]
+        return True
+    # What was shown as one crown may have been read as two: now it is said that they are.
+    other = _across(crowns, index, start, end)
+    if other is None:
         raise RequestError(
             f"{where}.split: the line doesn't cross the crown at {_said(change.at)}."
         )
-    crowns[index : index + 1] = [
-        replace(crown, outline=part, number=0, doubt=1.0, numbers={}) for part in parts
-    ]
+    crowns[index] = unknown
+    crowns[other] = replace(crowns[other], number=0, doubt=1.0, numbers={})
     return True
+
+
+def _across(crowns: list[Crown], index: int, start: Array, end: Array) -> int | None:
+    """The crown on the other side of a line that may be part of one with that of this index."""
+    across = np.array([start[1] - end[1], end[0] - start[0]])
+    side = [np.sign((centroid(c.outline) - start) @ across) for c in crowns]
+    mine = crowns[index]
+    for k, crown in enumerate(crowns):
+        if crown.jaw == mine.jaw and side[k] * side[index] < 0 and perhaps_one(mine, crown):
+            return k
+    return None
 
 
 def _crown_at(crowns: list[Crown], place: Array, said: Place, where: str) -> int:

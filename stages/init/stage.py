@@ -25,7 +25,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 32
+    version = 33
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.store import Store
 from stages.dentition.corrections import LEFT_OUT, apply_corrections, area, split_polygon
+from stages.dentition.crowns import dentition_of, outline_of
+from stages.dentition.parts import perhaps_one
 from tests import teeth_case as case
 
 GOOD = """
@@ -239,6 +242,26 @@ def test_a_crown_is_split_and_both_parts_numbered() -> None:
     missed = CrownCorrection((x, y), split=((x + 400, top), (x + 400, end)))
     with pytest.raises(RequestError, match="doesn't cross the crown"):
         applied(v000=PhotoCorrection(crowns=(missed,)))
+
+
+def test_crowns_that_were_shown_as_one_are_told_apart() -> None:
+    """A line along the border between two that look alike: nothing to cut, yet they are two."""
+    whole = case.teeth().views[0]
+    x, y = case.original(2, "upper")
+    outlines = [outline_of(crown) for crown in whole.all_crowns]
+    parts = split_polygon(
+        outlines[2].polygon, np.array([x, 0]) / case.SCALE, np.array([x, 9]) / case.SCALE
+    )
+    outlines[2:3] = [replace(outlines[2], polygon=part) for part in parts]
+    read = dentition_of(outlines, whole.name, whole.size, whole.kind, roll=0.0)
+    line = CrownCorrection((x - 8, y), split=((x + 1, y - 90), (x + 1, y + 90)))
+    after = applied(Teeth((read, *case.teeth().views[1:])), v000=PhotoCorrection(crowns=(line,)))[0]
+    found = after.upper[2:4]
+    assert [(crown.number, crown.doubt, dict(crown.numbers)) for crown in found] == [
+        (0, 1.0, {})
+    ] * 2
+    assert [area(a.outline) for a in found] == [area(b.outline) for b in read.upper[2:4]]
+    assert not perhaps_one(*found)
 
 
 def test_a_number_of_the_other_jaw_moves_the_crown() -> None:

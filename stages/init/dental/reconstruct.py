@@ -14,6 +14,7 @@ from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from stages.dentition.crowns import mirrored_dentition
 from stages.dentition.overlay import labelled_overlay, sheet
+from stages.dentition.parts import joined_parts
 from stages.dentition.working import resized_dentition, working_scale, working_view
 from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
@@ -147,6 +148,7 @@ def place_teeth(
     dentitions = [
         mirrored_dentition(d) if d and k in turned.mirrored else d for k, d in enumerate(dentitions)
     ]
+    turned, dentitions = with_whole_crowns(turned, dentitions)
     fit = turned.fit.enlarged([1 / scale for scale in scales])
     numbered = [
         None if dentition is None else with_numbers(dentition, placed, fit)
@@ -168,6 +170,26 @@ def place_teeth(
         for view, d in zip(views, numbered, strict=True)
     ]
     return PlacedTeeth(views, numbered, fit, turned, full)
+
+
+def with_whole_crowns(
+    turned: Turned, dentitions: list[Dentition | None]
+) -> tuple[Turned, list[Dentition | None]]:
+    """Crowns of which the fit says that they are parts of one, as one.
+
+    Args:
+        turned: the fit, its photographs at the size that was worked at.
+        dentitions: of the photographs as they are.
+    """
+
+    def joined(read: list[Dentition | None]) -> list[Dentition | None]:
+        return [
+            joined_parts(d, (placed.upper, placed.lower)) if d and placed else d
+            for d, placed in zip(read, turned.fit.views, strict=True)
+        ]
+
+    fit = replace(turned.fit, views=tuple(v and v.with_whole_crowns() for v in turned.fit.views))
+    return replace(turned, dentitions=joined(turned.dentitions), fit=fit), joined(dentitions)
 
 
 def with_surface(

@@ -44,6 +44,26 @@ class PlacedView:
         """FDI numbers of the crowns of one jaw."""
         return self.upper if jaw == "upper" else self.lower
 
+    def with_whole_crowns(self) -> PlacedView:
+        """The same with one crown for neighbours that have the same number."""
+        upper, upper_doubts = _whole(self.upper, self.upper_doubts)
+        lower, lower_doubts = _whole(self.lower, self.lower_doubts)
+        return replace(
+            self, upper=upper, lower=lower, upper_doubts=upper_doubts, lower_doubts=lower_doubts
+        )
+
+
+def _whole(
+    row: tuple[int, ...], doubts: tuple[float, ...]
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Numbers and doubts of a row, equal neighbours once and as sure as the surer one."""
+    kept: list[tuple[int, float]] = []
+    for tooth, doubt in zip(row, doubts, strict=True):
+        if kept and tooth == kept[-1][0] != 0:
+            doubt = min(doubt, kept.pop()[1])
+        kept.append((tooth, doubt))
+    return tuple(tooth for tooth, _ in kept), tuple(doubt for _, doubt in kept)
+
 
 @dataclass(frozen=True)
 class ArchFit:

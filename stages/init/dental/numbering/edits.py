@@ -1,16 +1,16 @@
-"""Labellings near a given one: gaps, missing teeth, merged and spurious crowns, shifts."""
+"""Labellings near a given one: other rows, missing teeth, shifts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, pairwise, product
+from itertools import combinations, product
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, teeth_of
-from stages.dentition.tooth_rows import NO_TOOTH, Labels
+from stages.dentition.row_edits import bounded, row_edits, shifted
+from stages.dentition.tooth_rows import Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.ends import end_labels, ends_cost
@@ -21,7 +21,6 @@ from stages.init.dental.numbering.hypotheses import (
     Scored,
     Scorer,
     ViewLabels,
-    contiguous,
 )
 from stages.init.dental.template import POSITIONS, position_of, tooth_at
 
@@ -52,60 +51,6 @@ NEAREST = 5
 LOOKS_WINDOW = 60.0
 #: Up to so many teeth may be hidden before the last crown of a row.
 HIDDEN_TEETH = 2
-
-
-def _bounded(labels: list[int]) -> Labels:
-    """Labels with those beyond the row's ends made `NO_TOOTH`."""
-    return tuple(label if 0 <= label < POSITIONS else NO_TOOTH for label in labels)
-
-
-def _shifted(labels: Labels, chosen: list[bool], by: int) -> list[int]:
-    """Labels with those chosen moved along the row."""
-    return [
-        label + by if take and label != NO_TOOTH else label
-        for label, take in zip(labels, chosen, strict=True)
-    ]
-
-
-def row_edits(labels: Labels) -> list[Labels]:
-    """Other labels of one row: a gap, a crown that is none or two, no gaps at all, a shift."""
-    count = len(labels)
-    edits: set[Labels] = set()
-    for i, label in enumerate(labels):
-        if label == NO_TOOTH:
-            continue
-        edits.add(contiguous(label - i, count))
-        if i in (0, count - 1):
-            # A row's end may be the next tooth but one, the one between hidden; or none.
-            outward = -1 if i == 0 else 1
-            for other in (label + outward, label - outward, NO_TOOTH):
-                edits.add(_bounded([*labels[:i], other, *labels[i + 1 :]]))
-            continue
-        for side in (-1, 1):
-            beyond = [(k - i) * side > 0 for k in range(count)]
-            if any(beyond):
-                edits.add(_bounded(_shifted(labels, beyond, side)))
-            for by in (-side, side):
-                changed = _shifted(labels, beyond, by)
-                changed[i] = NO_TOOTH
-                edits.add(_bounded(changed))
-            if 0 < i + side < count - 1:
-                changed = _shifted(labels, beyond, -side)
-                changed[i] = changed[i + side] = NO_TOOTH
-                edits.add(_bounded(changed))
-    for by in (-1, 1):
-        edits.add(_bounded(_shifted(labels, [True] * count, by)))
-    edits.discard(labels)
-    return sorted(
-        edit
-        for edit in edits
-        if all(b > a for a, b in _named_pairs(edit)) and sum(e != NO_TOOTH for e in edit) >= 2
-    )
-
-
-def _named_pairs(labels: Labels) -> Iterator[tuple[int, int]]:
-    named = [label for label in labels if label != NO_TOOTH]
-    return pairwise(named)
 
 
 def _allowed(view: int, jaw: int, labels: Labels, fixed: Fixed) -> bool:
@@ -175,7 +120,7 @@ def _renamed(row: Labels, position: int, by: int, to_gap: bool = False) -> Label
     chosen = [
         (label - position) * by >= 0 and (not to_gap or (end - label) * by > 0) for label in row
     ]
-    return _bounded(_shifted(row, chosen, by))
+    return bounded(shifted(row, chosen, by))
 
 
 def without_view(scorer: Scorer, scored: Scored, number: int) -> Scored:
@@ -276,10 +221,11 @@ def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[
             # The arch as the other views have it: this view's errors must not be built in.
             points = without_view(scorer, scored, number).adjusted.points
             now = row_trial(scorer, scored, points, number, labels)
+            rows = scorer.rows[labelling.views[number]]
             edits = [
                 with_row(labelling, number, jaw, edit)
                 for jaw in (0, 1)
-                for edit in row_edits(labels[jaw])
+                for edit in row_edits(labels[jaw], rows[jaw].wholes)
                 if _allowed(labelling.views[number], jaw, edit, fixed)
             ]
             for changed in plausible(scorer, labelling, edits, ROW_TRIALS):
@@ -335,7 +281,7 @@ def _moved(labelling: Labelling, steps: dict[int, int], jaws: tuple[int, ...]) -
     for number, by in steps.items():
         for jaw in jaws:
             row = labelling.labels[number][jaw]
-            new = _bounded(_shifted(row, [True] * len(row), by))
+            new = bounded(shifted(row, [True] * len(row), by))
             labelling = with_row(labelling, number, jaw, new)
     return labelling
 

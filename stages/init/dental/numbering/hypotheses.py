@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import is_upper
-from stages.dentition.tooth_rows import NO_TOOTH, Labels, best_rows
+from stages.dentition.tooth_rows import LOOKS, NO_TOOTH, Labels, best_rows
 from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
 from stages.init.dental.cameras.held import HeldCameras
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.ends import ends_cost, hidden_at_ends
-from stages.init.dental.numbering.sightings import LOOKS, SeenRow, SightingCache
+from stages.init.dental.numbering.sightings import SeenRow, SightingCache
 from stages.init.dental.template import POSITIONS, position_of, textbook_arch
 
 Array = npt.NDArray[np.float64]
@@ -80,11 +80,6 @@ class Scored:
     score: float
 
 
-def contiguous(first: int, count: int) -> Labels:
-    """Labels of a row without gaps that begins at position `first`; none beyond the ends."""
-    return tuple(first + i if 0 <= first + i < POSITIONS else NO_TOOTH for i in range(count))
-
-
 def row_defects(labels: Labels, absent: frozenset[int]) -> int:
     """How many crowns of a row are merged, split, spurious or skipped under its labels.
 
@@ -98,6 +93,7 @@ def row_defects(labels: Labels, absent: frozenset[int]) -> int:
     defects = 0
     for i, j in pairwise(named):
         nameless = j - i - 1
+        defects += labels[i] == labels[j]
         if not nameless and len(labels) > 2 and (i == 0 or j == len(labels) - 1):
             continue
         skipped = sum(p not in absent for p in range(labels[i] + 1, labels[j]))
@@ -293,7 +289,7 @@ def looks_cost(row: SeenRow, labels: Labels) -> float:
 def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
     """The labels of both rows of a view that look likeliest and that anatomy allows."""
     upper, lower = rows
-    best = [best_rows(row.looks, count, LOOKS) for row in rows]
+    best = [best_rows(row.looks, count, LOOKS, row.wholes) for row in rows]
     likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
     pairs = []
     for _, (a, b) in likeliest:

@@ -5,18 +5,21 @@ A label here is a position along the row, 0 (patient's right second molar) to 13
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, Point
+from stages.dentition.crowns import TIP_FLATNESS, ZENITH_FLATNESS
+from stages.dentition.parts import perhaps_one
 from stages.dentition.tooth_rows import (
+    LOOKS,
     NO_TOOTH,
     SAID_OTHERWISE,
-    ChainOptions,
     Labels,
     crown_evidence,
 )
@@ -32,8 +35,6 @@ from stages.init.dental.template import (
 
 Array = npt.NDArray[np.float64]
 
-#: How the looks of crowns count.
-LOOKS = ChainOptions()
 #: Place of a primary tooth -> shares in which it is taken for a tooth of that place, the next, and
 #: the next but one.
 TAKEN_FOR = {4: (0.45, 0.35, 0.20), 5: (0.30, 0.45, 0.25)}
@@ -46,6 +47,20 @@ EMBRASURE_DEVIATION = (0.035, 0.041)
 #: A papilla beside a doubtful crown is this much less certain; likewise one beside a gap.
 DOUBTFUL_FACTOR = 3.0
 GAP_FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Two neighbours of a row taken as one crown, in the units of `SeenRow`.
+
+    Attributes:
+        zenith, tip: [2]; nan where not to be relied on.
+        width: pixels.
+    """
+
+    zenith: Array
+    tip: Array
+    width: float
 
 
 @dataclass(frozen=True)
@@ -63,6 +78,7 @@ class SeenRow:
         doubtful: [n] bool.
         looks: [n, 14] log probability of each position by the crowns' looks.
         scores: [n] 0..1, how sure it is that each is a crown.
+        wholes: of neighbours that may be parts of one crown, by the place of the first: that crown.
     """
 
     jaw: Jaw
@@ -80,14 +96,19 @@ class SeenRow:
     doubtful: npt.NDArray[np.bool_]
     looks: Array
     scores: Array
+    wholes: Mapping[int, Whole] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.widths)
 
-    @cached_property
-    def landmark_count(self) -> int:
-        """How many landmarks the row offers to a labelling without gaps."""
-        return len(row_landmarks(self, tuple(range(len(self))), bounded=False)[0])
+    def landmark_count(self, labels: Labels) -> int:
+        """How many landmarks the row offers to labels without gaps that have the same parts of one
+        crown; without labels there are none."""
+        if not len(self):
+            return 0
+        parts = [a == b != NO_TOOTH for a, b in pairwise(labels or range(len(self)))]
+        whole = tuple(accumulate((not part for part in parts), initial=0))
+        return len(row_landmarks(self, whole, bounded=False)[0])
 
 
 def upright(points: Array, roll: float, width: int, height: int) -> Array:
@@ -149,9 +170,42 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                     -1, POSITIONS
                 ),
                 scores=np.array([crown.score for crown in crowns], np.float64),
+                wholes={
+                    k: _whole(
+                        [upright(c.outline, dentition.roll, width, height) for c in pair],
+                        jaw,
+                        float(dentition.band_height),
+                        bool(weak[k] or weak[k + 1]),
+                    )
+                    for k, pair in enumerate(pairwise(crowns))
+                    if perhaps_one(*pair)
+                },
             )
         )
     return rows[0], rows[1]
+
+
+def _whole(parts: list[Array], jaw: Jaw, band: float, weak: bool) -> Whole:
+    """One crown of two outlines [K, 2]."""
+    points = np.concatenate(parts)
+    nowhere = np.full(2, np.nan)
+    zenith, tip = (
+        _outermost(points, flatness * band, upwards)
+        for flatness, upwards in (
+            (ZENITH_FLATNESS, jaw == "upper"), (TIP_FLATNESS, jaw == "lower"),
+        )
+    )  # fmt: skip
+    return Whole(
+        nowhere if weak else zenith, nowhere if weak or jaw == "lower" else tip,
+        float(np.ptp(points[:, 0])),
+    )  # fmt: skip
+
+
+def _outermost(points: Array, flatness: float, upwards: bool) -> Array:
+    """[2] the middle of the points that lie furthest up, or down."""
+    height = -points[:, 1] if upwards else points[:, 1]
+    stretch = points[height >= height.max() - flatness]
+    return np.array([(stretch[:, 0].min() + stretch[:, 0].max()) / 2, points[height.argmax(), 1]])
 
 
 def as_a_childs(row: SeenRow) -> SeenRow:
@@ -178,7 +232,7 @@ def row_landmarks(
 
     Args:
         row: the row of crowns.
-        labels: position of each crown, or `NO_TOOTH`.
+        labels: position of each crown, or `NO_TOOTH`; parts of one crown have the same.
         bounded: False counts positions beyond the row's end too (to know how many there could be).
     """
     indices: list[int] = []
@@ -209,16 +263,20 @@ def row_landmarks(
     for i, label in enumerate(labels):
         if label == NO_TOOTH or not 0 <= label < last:
             continue
-        width = float(row.widths[i])
-        add(ZENITH, label, row.zeniths[i], ZENITH_DEVIATION, ZENITH_OF_WIDTH * width, 1.0)
-        add(TIP, label, row.tips[i], TIP_DEVIATION, TIP_OF_WIDTH * width, 1.0)
-        if label + 1 < last:
-            following = labels[i + 1] if i + 1 < count else NO_TOOTH
+        following = labels[i + 1] if i + 1 < count else NO_TOOTH
+        preceding = labels[i - 1] if i > 0 else NO_TOOTH
+        zenith, tip, width = row.zeniths[i], row.tips[i], float(row.widths[i])
+        if preceding == label:
+            whole = row.wholes[i - 1]
+            zenith, tip, width = whole.zenith, whole.tip, whole.width
+        if following != label:
+            add(ZENITH, label, zenith, ZENITH_DEVIATION, ZENITH_OF_WIDTH * width, 1.0)
+            add(TIP, label, tip, TIP_DEVIATION, TIP_OF_WIDTH * width, 1.0)
+        if label + 1 < last and following != label:
             factor = _factor(row, i, i + 1, following in (label + 1, NO_TOOTH))
             add(PAPILLA, label, row.papillae_right[i], PAPILLA_DEVIATION, 0.0, factor)
             add(EMBRASURE, label, row.embrasures_right[i], EMBRASURE_DEVIATION, 0.0, factor)
-        preceding = labels[i - 1] if i > 0 else NO_TOOTH
-        if label >= 1 and preceding != label - 1 and i > 0:
+        if label >= 1 and preceding not in (label - 1, label) and i > 0:
             # Its left papilla is not the right one of the crown before: a gap, or that is none.
             factor = _factor(row, i, i - 1, preceding == NO_TOOTH)
             add(PAPILLA, label - 1, row.papillae_left[i], PAPILLA_DEVIATION, 0.0, factor)
@@ -252,8 +310,10 @@ class SightingCache:
 
     def unused(self, view: int, jaw: int, labels: Labels) -> int:
         """How many landmarks of a row its labels leave without a name."""
-        named = len(self.of_row(view, jaw, labels)[0])
-        return max(self.rows[view][jaw].landmark_count - named, 0)
+        row, named = self.rows[view][jaw], len(self.of_row(view, jaw, labels)[0])
+        offered = row.landmark_count(labels)
+        # A gap names the papilla before it twice, which makes good for none between parts.
+        return row.landmark_count(()) - offered + max(offered - named, 0)
 
     def collect(self, views: list[int], labels: list[tuple[Labels, Labels]]) -> Sightings:
         """Sightings of some views under their labels; views are numbered as in `views`."""
