@@ -158,6 +158,18 @@ def test_the_fit_names_a_whole_crown_once() -> None:
         assert [len(row) for row in (dentition.upper, dentition.lower)] == [6, 6]
 
 
+def test_a_person_may_say_that_two_crowns_are_one() -> None:
+    parts = halved()
+    said = [
+        replace(crown, number=11, doubt=0.0) if k in (2, 3) else crown
+        for k, crown in enumerate(parts.upper)
+    ]
+    assert seen_rows(parts)[0].said_wholes == set()
+    assert seen_rows(replace(parts, upper=tuple(said)))[0].said_wholes == {2}
+    one = replace(parts, upper=(*said[:3], *parts.upper[3:]))
+    assert seen_rows(one)[0].said_wholes == set()
+
+
 @cache
 def mouth() -> tuple[list[Dentition], ArchFit, list[dict[str, tuple[int, ...]]]]:
     """Three photographs of a mouth, a tooth within a row of one of them read as two crowns."""

@@ -289,7 +289,7 @@ def looks_cost(row: SeenRow, labels: Labels) -> float:
 def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
     """The labels of both rows of a view that look likeliest and that anatomy allows."""
     upper, lower = rows
-    best = [best_rows(row.looks, count, LOOKS, row.wholes) for row in rows]
+    best = [best_rows(row.looks, count, LOOKS, row.said_wholes) for row in rows]
     likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
     pairs = []
     for _, (a, b) in likeliest:

@@ -101,6 +101,12 @@ class SeenRow:
     def __len__(self) -> int:
         return len(self.widths)
 
+    @property
+    def said_wholes(self) -> set[int]:
+        """Those of `wholes` of which a person has given both parts a number."""
+        said = self.looks.min(axis=1, initial=0.0) <= SAID_OTHERWISE
+        return {first for first in self.wholes if said[first] and said[first + 1]}
+
     def landmark_count(self, labels: Labels) -> int:
         """How many landmarks the row offers to labels without gaps that have the same parts of one
         crown; without labels there are none."""
