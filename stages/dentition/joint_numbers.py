@@ -8,7 +8,7 @@ and the spaces between neighbours number it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,15 +17,22 @@ import numpy.typing as npt
 from scipy.special import expit, softmax
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import JAWS, Jaw, primary_of, teeth_of
+from pipeline.artifacts.dental.fdi import (
+    JAWS,
+    Jaw,
+    is_primary,
+    permanent_of,
+    primary_of,
+    teeth_of,
+)
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
+from stages.dentition.changing_teeth import PRIMARY_PLACES, molars_cost, odds_of_left, primary_odds
 from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike, same_teeth
-from stages.dentition.spacing import spacing_evidence, unit_of
+from stages.dentition.spacing import Row, spacing_cost, spacing_evidence, unit_of
 from stages.dentition.tooth_rows import (
     POSITIONS,
     ChainOptions,
-    believed,
     crown_evidence,
     number_is_said,
     row_probabilities,
@@ -35,6 +42,8 @@ Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 #: Index of a photograph and of a crown among `Dentition.all_crowns` -> number and its doubt.
 Numbers = dict[tuple[int, int], tuple[int, float]]
+#: Permanent number -> log odds that a primary tooth stands there (`odds_of_left`).
+Primary = Mapping[int, float]
 
 #: Photographs of one tooth look alike and err together: n of them count as n to this power.
 JOINT_POWER = 0.75
@@ -44,8 +53,6 @@ PART, LEAST_SHOWN = 0.8, 1.0
 #: Weight of the expected places in the order of a row, against what photographs say.
 LOOKS_IN_ORDER = 1e-3
 LEAST_DOUBT = 1e-4
-#: In which all teeth's kinds settle.
-ROUNDS = 20
 #: How the order of a row counts.
 ROWS = ChainOptions()
 #: Number and doubt of what is no tooth.
@@ -62,7 +69,8 @@ class _Tooth:
         centre: [3] median of theirs.
         weight: as how many crowns it counts.
         evidence: [14] log probability of each position by its looks, times that.
-        primary: log odds of a primary tooth, if it stands in a place that has one, [14].
+        primary: mean log odds of a primary tooth; None where its looks say nothing of it.
+        said: number that a person has said, 0: none.
     """
 
     members: list[int]
@@ -70,7 +78,8 @@ class _Tooth:
     centre: Array
     weight: float
     evidence: Array
-    primary: Array
+    primary: float | None
+    said: int
 
 
 def agreed_numbers(
@@ -97,9 +106,9 @@ def agreed_numbers(
     if sum(dentition is not None for dentition in dentitions) < 2:
         return teeth
     overlaps = crown_overlaps(views, dentitions, cameras, depths)
-    numbers = _numbers(overlaps, dentitions, options)
+    numbers, primary = _numbers(overlaps, dentitions, options)
     changed = {
-        dentition.name: _renumbered(dentition, v, numbers, options)
+        dentition.name: _renumbered(dentition, v, numbers, primary, options)
         for v, dentition in enumerate(dentitions)
         if dentition is not None
     }
@@ -108,21 +117,21 @@ def agreed_numbers(
 
 
 def _renumbered(
-    dentition: Dentition, view: int, numbers: Numbers, options: ChainOptions
+    dentition: Dentition, view: int, numbers: Numbers, primary: Primary, options: ChainOptions
 ) -> Dentition:
     """A photograph's crowns with the numbers agreed on; the others' by the row that these make."""
     known = [numbers.get((view, index)) for index in range(len(dentition.all_crowns))]
     rows, start = {}, 0
     for jaw in JAWS:
         crowns = dentition.crowns(jaw)
-        rows[jaw] = _completed(crowns, known[start : start + len(crowns)], jaw, options)
+        rows[jaw] = _completed(crowns, known[start : start + len(crowns)], jaw, primary, options)
         start += len(crowns)
     return replace(dentition, upper=rows["upper"], lower=rows["lower"])
 
 
 def _completed(
     crowns: Sequence[Crown], known: Sequence[tuple[int, float] | None], jaw: Jaw,
-    options: ChainOptions,
+    primary: Primary, options: ChainOptions,
 ) -> tuple[Crown, ...]:  # fmt: skip
     """One row: crowns without an agreed number stand between those that have one, as sure ones."""
     result = list(crowns)
@@ -141,15 +150,14 @@ def _completed(
         if known[k] is None and not number_is_said(crowns[k]):
             place, number, doubt = int(np.argmax(share)), *NONE
             if place < POSITIONS:
-                odds = float(_primary(crowns[k], jaw)[place])
-                number, doubt = _number(jaw, place, float(share[place]), odds)
+                number, doubt = _number(jaw, place, float(share[place]), primary)
             result[k] = replace(crowns[k], number=number, doubt=doubt)
     return tuple(result)
 
 
 def _numbers(
     overlaps: Overlaps, dentitions: Sequence[Dentition | None], options: ChainOptions
-) -> Numbers:
+) -> tuple[Numbers, Primary]:
     crowns = []
     for sighting in overlaps.sightings:
         dentition = dentitions[sighting.view]
@@ -166,17 +174,18 @@ def _numbers(
             if crowns[group[0]].jaw == jaw and whole[k] == k and len(group) > 1
         ]
         rows.append([found[k] for k in _order(found, overlaps)])
+    places = _places(rows, options)
     named = [
         (tooth, int(np.argmax(share)), float(share.max()))
-        for row, shares in zip(rows, _places(rows, options), strict=True)
+        for row, shares in zip(rows, places, strict=True)
         for tooth, share in zip(row, shares, strict=True)
         if np.argmax(share) < POSITIONS
     ]
-    primary = _primary_odds([tooth.primary[place] for tooth, place, _ in named])
+    primary = _primary(named, _standing(rows, places))
     result: Numbers = {}
-    for (tooth, place, sure), odds in zip(named, primary, strict=True):
+    for tooth, place, sure in named:
         for member in tooth.members:
-            result[overlaps.place(member)] = _number(tooth.jaw, place, sure, odds)
+            result[overlaps.place(member)] = _number(tooth.jaw, place, sure, primary)
     for k, group in enumerate(groups):
         if whole[k] != k:
             first = groups[whole[k]][0]
@@ -184,7 +193,7 @@ def _numbers(
             for member in group:
                 number = result.get(overlaps.place(first), NONE) if same else NONE
                 result[overlaps.place(member)] = number
-    return result
+    return result, primary
 
 
 def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:
@@ -195,17 +204,23 @@ def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:
     """
     evidence = [np.array([tooth.evidence for tooth in row]).reshape(-1, POSITIONS) for row in rows]
     weights = [np.array([tooth.weight for tooth in row]) for row in rows]
-    centres = [np.array([tooth.centre for tooth in row]).reshape(-1, 3) for row in rows]
     given = list(zip(evidence, weights, strict=True))
     first = [row_probabilities(looks, options, weight)[0] for looks, weight in given]
-    unit = unit_of(
-        [(jaw, place, s.argmax(1)) for jaw, place, s in zip(JAWS, centres, first, strict=True)]
-    )
+    standing = _standing(rows, first)
+    unit = unit_of(standing)
     if unit is None:
         return first
     return [
-        row_probabilities(looks, options, weight, spacing_evidence(jaw, place, unit))[0]
-        for jaw, place, (looks, weight) in zip(JAWS, centres, given, strict=True)
+        row_probabilities(looks, options, weight, spacing_evidence(jaw, centres, unit))[0]
+        for (jaw, centres, _), (looks, weight) in zip(standing, given, strict=True)
+    ]
+
+
+def _standing(rows: list[list[_Tooth]], shares: list[Array]) -> list[Row]:
+    """The rows with where their teeth stand and the likeliest position of each."""
+    return [
+        (jaw, np.array([tooth.centre for tooth in row]).reshape(-1, 3), share.argmax(1))
+        for jaw, row, share in zip(JAWS, rows, shares, strict=True)
     ]
 
 
@@ -237,20 +252,13 @@ def _tooth(
     ]
     looks = np.array([crown_evidence(crown, jaw, options) for crown in heard])
     weight = len(members) ** JOINT_POWER
-    primary = np.array([_primary(crown, jaw) for crown in heard]).mean(0) * weight
+    odds = [value for value in map(primary_odds, heard) if value is not None]
     centre = np.median([overlaps.sightings[k].centre for k in members], axis=0)
-    return _Tooth(members, jaw, centre, weight, looks.mean(0) * weight, primary)
-
-
-def _primary(crown: Crown, jaw: Jaw) -> Array:
-    """[14] log odds of a primary tooth in each place; -inf where there is none."""
-    numbers = believed(crown)
-    odds = np.full(POSITIONS, -np.inf)
-    for position, tooth in enumerate(teeth_of(jaw)):
-        if tooth % 10 <= 5:
-            milk, lasting = (numbers.get(n, 0.0) + 1e-3 for n in (primary_of(tooth), tooth))
-            odds[position] = np.log(milk / lasting)
-    return odds
+    return _Tooth(
+        members, jaw, centre, weight, looks.mean(0) * weight,
+        float(np.mean(odds)) if odds else None,
+        heard[0].number if number_is_said(heard[0]) else 0,
+    )  # fmt: skip
 
 
 def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
@@ -286,26 +294,36 @@ def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
     return [int(k) for k in np.argsort(along, kind="stable")]
 
 
-def _primary_odds(odds: Sequence[float]) -> list[float]:
-    """Log odds of primary teeth, knowing the others of the mouth: -inf stays.
+def _primary(named: Sequence[tuple[_Tooth, int, float]], rows: Sequence[Row]) -> Primary:
+    """What named teeth say together of where primary ones stand: by their looks, their distances
+    and the permanent molars beside them, for a grown-up's teeth may look like a child's.
 
-    The share of primary teeth among the places that have one is unknown (Jeffreys' prior), and the
-    other teeth tell it: where all are permanent, a retained one must look the more like it.
+    Args:
+        named: teeth with their positions, and how sure these are.
+        rows: of all of them.
     """
-    looks = np.array(odds, np.float64)
-    able = np.isfinite(looks)
-    posterior = looks[able]
-    for _ in range(ROUNDS):
-        shares = expit(posterior)
-        others = shares.sum() - shares
-        posterior = looks[able] + np.log((others + 0.5) / (len(shares) - 1 - others + 0.5))
-    looks[able] = posterior
-    return looks.tolist()
+    looks: dict[int, list[float]] = {}
+    said: dict[int, bool] = {}
+    molars = {6: 0.0, 7: 0.0}
+    for tooth, position, _ in named:
+        number = teeth_of(tooth.jaw)[position]
+        if number % 10 in molars:
+            molars[number % 10] += tooth.weight
+        if tooth.primary is not None and number % 10 <= PRIMARY_PLACES:
+            looks.setdefault(number, []).append(tooth.primary)
+        if tooth.said:
+            said[permanent_of(tooth.said)] = is_primary(tooth.said)
+    mean = {number: float(np.mean(odds)) for number, odds in looks.items()}
+    return odds_of_left(
+        mean, said,
+        lambda primary: spacing_cost(rows, primary) + molars_cost(primary, molars[6], molars[7]),
+    )  # fmt: skip
 
 
-def _number(jaw: Jaw, place: int, sure: float, odds: float) -> tuple[int, float]:
-    """FDI number and doubt of a place in the row, how sure that is, and log odds of primary."""
+def _number(jaw: Jaw, place: int, sure: float, primary: Primary) -> tuple[int, float]:
+    """FDI number and doubt of a place in the row, and how sure that is."""
     number = teeth_of(jaw)[place]
+    odds = primary.get(number, -np.inf)
     if odds > 0:
         number = primary_of(number)
     return number, float(np.clip(1 - sure * expit(abs(odds)), LEAST_DOUBT, 1))

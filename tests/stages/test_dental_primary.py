@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from stages.init.dental.numbering.primary import (
-    ALL_PRIMARY,
+from stages.dentition.changing_teeth import (
     CONTRAST,
     EVEN_ODDS,
     LEFT,
     OUT_OF_ORDER_COST,
     looks_cost,
+    molars_cost,
+    odds_of_left,
 )
+from stages.init.dental.numbering.primary import ALL_PRIMARY
 
 SEEN = tuple(sorted(ALL_PRIMARY))
 
@@ -67,3 +69,42 @@ def test_looks_that_say_nothing_cost_nothing() -> None:
     assert looks_cost({}, frozenset({15})) == 0
     even = dict.fromkeys(SEEN, EVEN_ODDS)
     assert looks_cost(even, frozenset()) == looks_cost(even, ALL_PRIMARY) == 0
+
+
+def anywhere(primary: frozenset[int]) -> float:
+    """Where the teeth stand says nothing."""
+    return 0.0
+
+
+def told(odds: dict[int, float]) -> set[int]:
+    return {tooth for tooth, value in odds.items() if value > 0}
+
+
+def test_looks_and_order_together_tell_every_tooth() -> None:
+    """Of a tooth of which nothing is seen, the order tells."""
+    milk = places(3, 4, 5)
+    found = looks(milk, -3.0)
+    del found[14], found[41]
+    assert told(odds_of_left(found, {}, anywhere)) == milk
+    assert told(odds_of_left(looks(set(), -1.5), {}, anywhere)) == set()
+    assert told(odds_of_left(looks({35}, -1.0), {}, anywhere)) == {35}
+    odds = odds_of_left(found, {}, anywhere)
+    assert abs(odds[14]) < abs(odds[24]), "it is less sure"
+
+
+def test_what_a_person_said_of_a_tooth_stands() -> None:
+    odds = odds_of_left(looks(set(SEEN), -3.0), {15: False, 45: True}, anywhere)
+    assert told(odds) == set(SEEN) - {15}
+    assert min(-odds[15], odds[45]) > 9
+
+
+def test_second_molars_speak_against_primary_teeth() -> None:
+    """They come when the last of those go, and first molars when the central incisors do."""
+    childs = looks(set(SEEN), -3.0)
+
+    def told_beside(first: float, second: float) -> set[int]:
+        beside = odds_of_left(childs, {}, lambda primary: molars_cost(primary, first, second))
+        return told(beside)
+
+    assert told_beside(0, 0) == told_beside(4, 1) == set(SEEN)
+    assert told_beside(12, 12) == set()

@@ -89,7 +89,7 @@ def test_what_a_person_said_of_one_photograph_counts_for_all() -> None:
     assert [c.doubt for c in found[0].upper if c.number == 15] == [0.0]
 
 
-@pytest.mark.parametrize(("primary", "number"), [(0.55, 15), (0.998, 55)])
+@pytest.mark.parametrize(("primary", "number"), [(0.003, 15), (0.5, 55)])
 def test_a_primary_tooth_among_permanent_ones_must_look_the_more_like_it(
     primary: float, number: int
 ) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.artifacts.dental.fdi import teeth_of
-from stages.dentition.spacing import spacing_evidence, textbook_distances, unit_of
+from pipeline.artifacts.dental.fdi import JAWS, teeth_of
+from stages.dentition.spacing import spacing_cost, spacing_evidence, textbook_distances, unit_of
 from stages.dentition.tooth_rows import POSITIONS, ChainOptions, row_probabilities
 
 UNIT = 0.01
@@ -74,3 +74,23 @@ def test_spaces_of_the_textbook_change_nothing() -> None:
     blind, _ = row_probabilities(looks, ChainOptions())
     told, _ = row_probabilities(looks, ChainOptions(), spacing=spacing)
     assert told.argmax(1).tolist() == blind.argmax(1).tolist() == positions
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.04])
+def test_distances_tell_a_childs_row_from_a_grown_ups(unit: float) -> None:
+    """Whatever a millimetre is in the world."""
+    rng = np.random.default_rng(3)
+    milk = frozenset(tooth for jaw in JAWS for tooth in teeth_of(jaw) if tooth % 10 <= 5)
+    half = frozenset(tooth for tooth in milk if tooth % 10 >= 3)
+    positions = np.arange(1, 13)
+    for true in (frozenset(), half, milk):
+        rows = []
+        for jaw in JAWS:
+            along = textbook_distances(jaw, true)[0, positions]
+            along = np.cumsum(np.diff(along, prepend=0) * np.exp(rng.normal(scale=0.1, size=12)))
+            places = np.stack([unit * along, np.zeros(12), np.zeros(12)], 1)
+            rows.append((jaw, places, positions))
+        costs = {primary: spacing_cost(rows, primary) for primary in (frozenset(), half, milk)}
+        assert min(costs, key=lambda primary: costs[primary]) == true
+        assert sorted(costs.values())[1] > costs[true] + 5
+    assert spacing_cost([("upper", np.zeros((1, 3)), np.array([4]))], milk) == 0
