@@ -7,17 +7,15 @@ comes of it is weighed; then single teeth may be out of order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import product
 
 import numpy as np
 
-from pipeline.artifacts.dental.fdi import JAWS, is_primary, teeth_of
-from pipeline.artifacts.teeth import Crown
-from stages.dentition.tooth_rows import believed
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, is_primary, permanent_of, teeth_of
+from pipeline.artifacts.teeth import Crown, Dentition
+from stages.dentition.tooth_rows import believed, number_is_said
 
-#: Places from the midline that have primary teeth.
-PRIMARY_PLACES = 5
 #: Places from the midline at which a jaw's primary teeth are left, as they go: incisors first; then
 #: the canine mostly first in the lower jaw and last in the upper one.
 LEFT = ((1, 2, 3, 4, 5), (2, 3, 4, 5), (3, 4, 5), (4, 5), (3, 5), (5,), (3,), ())
@@ -62,6 +60,16 @@ def primary_odds(crown: Crown) -> float | None:
     if milk + rest < LEAST_SHARE:
         return None
     return float(np.log(max(milk, LEAST_PROBABILITY) / max(rest, LEAST_PROBABILITY)))
+
+
+def said_numbers(dentitions: Iterable[Dentition]) -> dict[int, bool]:
+    """Permanent number -> whether a person has said that a primary tooth stands there."""
+    return {
+        permanent_of(crown.number): is_primary(crown.number)
+        for dentition in dentitions
+        for crown in dentition.all_crowns
+        if number_is_said(crown) and crown.number % 10 <= PRIMARY_PLACES
+    }
 
 
 def looks_cost(looks: Mapping[int, float], primary: frozenset[int]) -> float:

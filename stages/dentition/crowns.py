@@ -232,12 +232,18 @@ def _resampled(polygon: Array, step: float) -> Array:
     return np.concatenate(parts)
 
 
+def outermost(along: Array, height: Array, flatness: float) -> tuple[float, float]:
+    """(along, height) of the middle of the highest stretch of an outline's points [N]."""
+    top = float(height.max())
+    stretch = along[height >= top - flatness]
+    return float((stretch.min() + stretch.max()) / 2), top
+
+
 def _extreme(local: _Local, flatness: float, towards_gum: bool) -> tuple[float, float]:
     """(along, gumward) of the middle of the outermost stretch of an outline."""
-    height = local.gum if towards_gum else -local.gum
-    top = float(height.max())
-    stretch = local.along[height >= top - flatness]
-    return float((stretch.min() + stretch.max()) / 2), top if towards_gum else -top
+    sign = 1.0 if towards_gum else -1.0
+    along, height = outermost(local.along, sign * local.gum, flatness)
+    return along, sign * height
 
 
 def _envelope(coordinate: Array, value: Array, at: Array, largest: bool) -> Array:

@@ -17,17 +17,10 @@ import numpy.typing as npt
 from scipy.special import expit, softmax
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import (
-    JAWS,
-    Jaw,
-    is_primary,
-    permanent_of,
-    primary_of,
-    teeth_of,
-)
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
-from stages.dentition.changing_teeth import PRIMARY_PLACES, molars_cost, odds_of_left, primary_odds
+from stages.dentition.changing_teeth import molars_cost, odds_of_left, primary_odds, said_numbers
 from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike, same_teeth
 from stages.dentition.spacing import Row, spacing_cost, spacing_evidence, unit_of
 from stages.dentition.tooth_rows import (
@@ -70,7 +63,6 @@ class _Tooth:
         weight: as how many crowns it counts.
         evidence: [14] log probability of each position by its looks, times that.
         primary: mean log odds of a primary tooth; None where its looks say nothing of it.
-        said: number that a person has said, 0: none.
     """
 
     members: list[int]
@@ -79,7 +71,6 @@ class _Tooth:
     weight: float
     evidence: Array
     primary: float | None
-    said: int
 
 
 def agreed_numbers(
@@ -181,7 +172,8 @@ def _numbers(
         for tooth, share in zip(row, shares, strict=True)
         if np.argmax(share) < POSITIONS
     ]
-    primary = _primary(named, _standing(rows, places))
+    said = said_numbers(dentition for dentition in dentitions if dentition)
+    primary = _primary(named, _standing(rows, places), said)
     result: Numbers = {}
     for tooth, place, sure in named:
         for member in tooth.members:
@@ -257,7 +249,6 @@ def _tooth(
     return _Tooth(
         members, jaw, centre, weight, looks.mean(0) * weight,
         float(np.mean(odds)) if odds else None,
-        heard[0].number if number_is_said(heard[0]) else 0,
     )  # fmt: skip
 
 
@@ -294,16 +285,18 @@ def _order(teeth: list[_Tooth], overlaps: Overlaps) -> list[int]:
     return [int(k) for k in np.argsort(along, kind="stable")]
 
 
-def _primary(named: Sequence[tuple[_Tooth, int, float]], rows: Sequence[Row]) -> Primary:
+def _primary(
+    named: Sequence[tuple[_Tooth, int, float]], rows: Sequence[Row], said: Mapping[int, bool]
+) -> Primary:
     """What named teeth say together of where primary ones stand: by their looks, their distances
     and the permanent molars beside them, for a grown-up's teeth may look like a child's.
 
     Args:
         named: teeth with their positions, and how sure these are.
         rows: of all of them.
+        said: of `said_numbers`.
     """
     looks: dict[int, list[float]] = {}
-    said: dict[int, bool] = {}
     molars = {6: 0.0, 7: 0.0}
     for tooth, position, _ in named:
         number = teeth_of(tooth.jaw)[position]
@@ -311,8 +304,6 @@ def _primary(named: Sequence[tuple[_Tooth, int, float]], rows: Sequence[Row]) ->
             molars[number % 10] += tooth.weight
         if tooth.primary is not None and number % 10 <= PRIMARY_PLACES:
             looks.setdefault(number, []).append(tooth.primary)
-        if tooth.said:
-            said[permanent_of(tooth.said)] = is_primary(tooth.said)
     mean = {number: float(np.mean(odds)) for number, odds in looks.items()}
     return odds_of_left(
         mean, said,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import softmax
 
-from pipeline.artifacts.dental.fdi import JAWS, Jaw, primary_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.crowns import Outline, centroid, dentition_of, row_roll
 from stages.dentition.tooth_rows import (
@@ -222,7 +222,7 @@ def _with_number(crown: Crown, jaw: Jaw, share: npt.NDArray[np.float64]) -> Crow
     if best == POSITIONS:
         return replace(crown, number=0, doubt=1.0)
     tooth = teeth_of(jaw)[best]
-    if tooth % 10 <= 5:
+    if tooth % 10 <= PRIMARY_PLACES:
         milk = primary_of(tooth)
         if crown.numbers.get(milk, 0.0) > crown.numbers.get(tooth, 0.0):
             tooth = milk

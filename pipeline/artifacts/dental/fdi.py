@@ -16,6 +16,8 @@ ALL_TEETH = frozenset(
     [10 * q + p for q in range(1, 5) for p in range(1, 9)]
     + [10 * q + p for q in range(5, 9) for p in range(1, 6)]
 )
+#: Primary teeth have so many places from the midline.
+PRIMARY_PLACES = 5
 _PRIMARY_LETTERS = "ABCDEFGHIJKLMNOPQRST"
 
 
@@ -45,7 +47,7 @@ def primary_of(tooth: int) -> int:
     Raises:
         ValueError: molars have no predecessor.
     """
-    if tooth % 10 > 5:
+    if tooth % 10 > PRIMARY_PLACES:
         raise ValueError(f"no primary tooth stands where {tooth} will")
     return tooth if is_primary(tooth) else tooth + 40
 
@@ -74,7 +76,7 @@ def universal_number(tooth: int) -> str:
     """
     if tooth not in ALL_TEETH:
         raise ValueError(f"{tooth} is no FDI number of a tooth (11-48, 51-85)")
-    count = 5 if is_primary(tooth) else 8
+    count = PRIMARY_PLACES if is_primary(tooth) else 8
     place = tooth % 10
     quadrant = permanent_of(tooth) // 10
     # Clockwise as the dentist sees it: upper right, upper left, lower left, lower right.

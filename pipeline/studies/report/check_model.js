@@ -124,7 +124,9 @@ const problemsOf = (photo) => {
   for (const number of new Set(numbered.map((crown) => crown.number))) {
     const same = numbered.filter((crown) => crown.number === number);
     if (same.length > 1) {
-      found.push({ text: `${number} stands ${same.length === 2 ? "twice" : `${same.length} times`}`,
+      const often = same.length === 2 ? "twice: right only for two parts of one crown"
+        : `${same.length} times`;
+      found.push({ text: `${number} stands ${often}`,
         crowns: same.map((crown) => crown.id) });
     }
   }

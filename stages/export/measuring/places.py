@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import permanent_of
+from pipeline.artifacts.dental.fdi import PRIMARY_PLACES, permanent_of
 from stages.export.measuring.landmarks import Name
 
 Array = npt.NDArray[np.float64]
@@ -17,7 +17,7 @@ Places = Mapping[tuple[Name, int], Array]
 
 def with_primary(group: Sequence[int]) -> list[int]:
     """Permanent teeth, and the primary ones that may stand in their places."""
-    return [*group, *(n + 40 for n in group if n % 10 <= 5)]
+    return [*group, *(n + 40 for n in group if n % 10 <= PRIMARY_PLACES)]
 
 
 def places_of(places: Places, teeth: Collection[int]) -> Places:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.fdi import PRIMARY_PLACES, Jaw, is_upper, teeth_of
 from pipeline.artifacts.dental.sizes import HEIGHTS, PRIMARY_HEIGHTS, PRIMARY_WIDTHS, WIDTHS
 from stages.init.dental.landmarks import Landmark
 
@@ -35,8 +35,6 @@ OVERBITE, OVERJET = 2.5, 2.2
 GUM_STEPS = ((4.0, 0.8), (9.0, -0.5))
 #: Teeth a side, without wisdom teeth.
 TEETH_A_SIDE = 7
-#: Of a jaw's teeth so many on either side are primary before they change.
-PRIMARY_TEETH_A_SIDE = 5
 #: The curve goes on so far (mm) as a straight line.
 STRAIGHT_ON = 30.0
 #: Positions along a row, patient's right to left; the midline is between 6 and 7.
@@ -124,7 +122,7 @@ def _half_jaw(jaw: Jaw, absent: frozenset[int], primary: frozenset[int]) -> Arra
     heights = np.array(
         [PRIMARY_HEIGHTS[jaw][i] if i in primary else h for i, h in enumerate(HEIGHTS[jaw])]
     )
-    arc, x, z = _arch_curve(*_curve_of(jaw, len(primary) / PRIMARY_TEETH_A_SIDE))
+    arc, x, z = _arch_curve(*_curve_of(jaw, len(primary) / PRIMARY_PLACES))
     borders = np.concatenate([[0.0], np.cumsum(widths)])
     towards_gum = 1.0 if upper else -1.0
 

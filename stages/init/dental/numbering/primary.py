@@ -12,18 +12,18 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import JAWS, is_primary, permanent_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.changing_teeth import (
     EVEN_ODDS,
     MOST_ODDS,
-    PRIMARY_PLACES,
     cheapest_left,
     looks_cost,
     molars_cost,
     primary_odds,
+    said_numbers,
 )
-from stages.dentition.tooth_rows import NO_TOOTH, number_is_said
+from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
 from stages.init.dental.template import tooth_at
 
@@ -92,13 +92,3 @@ def place_odds(labelling: Labelling, dentitions: list[Dentition]) -> dict[int, f
                 if odds is not None:
                     values.setdefault(tooth_at(jaw, label), []).append(odds)
     return {tooth: float(np.mean(odds)) for tooth, odds in values.items()}
-
-
-def said_numbers(dentitions: list[Dentition]) -> dict[int, bool]:
-    """Permanent number -> whether a person has said that a primary tooth stands there."""
-    return {
-        permanent_of(crown.number): is_primary(crown.number)
-        for dentition in dentitions
-        for crown in dentition.all_crowns
-        if number_is_said(crown) and crown.number % 10 <= PRIMARY_PLACES
-    }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, Point
-from stages.dentition.crowns import TIP_FLATNESS, ZENITH_FLATNESS
+from stages.dentition.crowns import TIP_FLATNESS, ZENITH_FLATNESS, outermost
 from stages.dentition.parts import perhaps_one
 from stages.dentition.tooth_rows import (
     LOOKS,
@@ -107,12 +108,16 @@ class SeenRow:
         said = self.looks.min(axis=1, initial=0.0) <= SAID_OTHERWISE
         return {first for first in self.wholes if said[first] and said[first + 1]}
 
-    def landmark_count(self, labels: Labels) -> int:
-        """How many landmarks the row offers to labels without gaps that have the same parts of one
-        crown; without labels there are none."""
-        if not len(self):
-            return 0
-        parts = [a == b != NO_TOOTH for a, b in pairwise(labels or range(len(self)))]
+    @cached_property
+    def landmark_count(self) -> int:
+        """How many landmarks the row offers to a labelling without gaps."""
+        return len(row_landmarks(self, tuple(range(len(self))), bounded=False)[0])
+
+    def count_with_parts(self, labels: Labels) -> int:
+        """The same where neighbours with equal labels are parts of one crown."""
+        parts = [a == b != NO_TOOTH for a, b in pairwise(labels)]
+        if not any(parts):
+            return self.landmark_count
         whole = tuple(accumulate((not part for part in parts), initial=0))
         return len(row_landmarks(self, whole, bounded=False)[0])
 
@@ -194,24 +199,15 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
 def _whole(parts: list[Array], jaw: Jaw, band: float, weak: bool) -> Whole:
     """One crown of two outlines [K, 2]."""
     points = np.concatenate(parts)
-    nowhere = np.full(2, np.nan)
-    zenith, tip = (
-        _outermost(points, flatness * band, upwards)
-        for flatness, upwards in (
-            (ZENITH_FLATNESS, jaw == "upper"), (TIP_FLATNESS, jaw == "lower"),
-        )
-    )  # fmt: skip
-    return Whole(
-        nowhere if weak else zenith, nowhere if weak or jaw == "lower" else tip,
-        float(np.ptp(points[:, 0])),
-    )  # fmt: skip
-
-
-def _outermost(points: Array, flatness: float, upwards: bool) -> Array:
-    """[2] the middle of the points that lie furthest up, or down."""
-    height = -points[:, 1] if upwards else points[:, 1]
-    stretch = points[height >= height.max() - flatness]
-    return np.array([(stretch[:, 0].min() + stretch[:, 0].max()) / 2, points[height.argmax(), 1]])
+    gumwards = -1.0 if jaw == "upper" else 1.0  # rows of pixels grow downwards
+    marks = []
+    for sign, flatness, seen in (
+        (gumwards, ZENITH_FLATNESS, not weak),
+        (-gumwards, TIP_FLATNESS, not weak and jaw == "upper"),
+    ):
+        x, height = outermost(points[:, 0], sign * points[:, 1], flatness * band)
+        marks.append(np.array([x, sign * height]) if seen else np.full(2, np.nan))
+    return Whole(marks[0], marks[1], float(np.ptp(points[:, 0])))
 
 
 def as_a_childs(row: SeenRow) -> SeenRow:
@@ -317,9 +313,9 @@ class SightingCache:
     def unused(self, view: int, jaw: int, labels: Labels) -> int:
         """How many landmarks of a row its labels leave without a name."""
         row, named = self.rows[view][jaw], len(self.of_row(view, jaw, labels)[0])
-        offered = row.landmark_count(labels)
+        offered = row.count_with_parts(labels)
         # A gap names the papilla before it twice, which makes good for none between parts.
-        return row.landmark_count(()) - offered + max(offered - named, 0)
+        return row.landmark_count - offered + max(offered - named, 0)
 
     def collect(self, views: list[int], labels: list[tuple[Labels, Labels]]) -> Sightings:
         """Sightings of some views under their labels; views are numbered as in `views`."""
