@@ -11,7 +11,7 @@ BIN := .venv/bin
 SEED ?= 0
 INPUTS ?= 1000
 KILLS ?= 30
-.PHONY: demo test browsers clusters lint wheel-test docs gallery bench soak reader system chromium clean
+.PHONY: demo test browsers clusters lint wheel-test docs gallery bench soak reader reader-tissue system chromium clean
 
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
@@ -73,6 +73,15 @@ reader: .venv/installed-dev
 	$(BIN)/python tools/reader/train.py --data "$(DATA)" --labels tools/reader/labels.json \
 	    --unlabelled runs/unlabelled --mouths runs/mouths/* --steps $(STEPS) --rate $(RATE) \
 	    --device $(DEVICE) --workers $(WORKERS) $(if $(START),--start $(START)) --out runs/reader.pt
+	$(MAKE) reader-tissue DATA="$(DATA)" START=runs/reader.pt
+
+# Its last part alone, which tells teeth and gum from lips, cheeks and retractors: twenty minutes on two
+# cores, with the mouths that are there.
+reader-tissue: START ?= stages/teeth/reader.onnx
+reader-tissue: .venv/installed-dev
+	MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=8000000000 \
+	    $(BIN)/python tools/reader/train_tissue.py --data "$(DATA)" --tissue tools/reader/tissue.json \
+	    --mouths runs/mouths/* --start $(START) --out runs/reader.pt
 	$(BIN)/python tools/reader/export.py runs/reader.pt stages/teeth/reader.onnx
 	$(BIN)/python tools/reader/score.py --data "$(DATA)"
 

@@ -30,6 +30,8 @@ TIDY = {
     "seed": 5,
 }
 WISDOM = (18, 28, 38, 48)
+#: What gum is in the files of labels.
+GUM = 1
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,16 @@ def test_every_role_sees_its_side(plain: dict[str, Any]) -> None:
     assert plain["upper"].bite == plain["lower"].bite == "open"
 
 
+def test_gum_surrounds_the_teeth_and_is_none_of_them(plain: dict[str, Any]) -> None:
+    for role in ("front", "right", "left"):
+        photo = plain[role]
+        assert photo.gum.dtype == bool
+        assert not (photo.gum & (photo.labels > 0)).any()
+        assert (photo.depth[photo.gum] > 0).all()
+        ring = cv2.dilate((photo.labels > 0).astype(np.uint8), np.ones((5, 5))) > 0
+        assert photo.gum[ring & (photo.labels == 0)].mean() > 0.5, role
+
+
 def test_missing_teeth_are_absent(plain: dict[str, Any]) -> None:
     for photo in plain.values():
         assert not np.isin(photo.labels, (12, 46, *WISDOM)).any()
@@ -150,6 +162,8 @@ def test_what_stands_in_front_is_not_labelled(mouths: ModuleType, mouth: Any) ->
         dressed = take(mouths, mouth, "front", seed, camera=camera, bite="closed")
         kept = dressed.depth > 0
         assert not dressed.labels[~kept].any()
+        assert not (dressed.gum & ~bare.gum).any()
+        assert dressed.gum.sum() < bare.gum.sum()
         same = dressed.labels[kept] == bare.labels[kept]
         assert same.mean() > 0.999
         taken += int((~kept & (bare.depth > 0)).sum())
@@ -223,7 +237,7 @@ def test_command_line_writes_pictures_labels_and_index(mouths: ModuleType, tmp_p
         assert labels is not None
         assert image.shape[:2] == labels.shape == (entry["height"], entry["width"])
         assert labels.dtype == np.uint8
-        assert sorted(n for n in np.unique(labels).tolist() if n) == entry["teeth"]
+        assert sorted(n for n in np.unique(labels).tolist() if n > GUM) == entry["teeth"]
         assert entry["view"] in ROLES
         assert entry["bite"] in ("closed", "open")
         assert isinstance(entry["primary"], bool)

@@ -18,9 +18,11 @@ pytest.importorskip("onnx")
 from augment import example, frame  # noqa: E402
 from brackets import draw_braces  # noqa: E402
 from export import to_onnx  # noqa: E402
-from network import CHANNELS, HEIGHT, JAW, SHAPES, VIEWS, WIDTH, Reader  # noqa: E402
-from samples import MIRRORED, UNNUMBERED, Sample, distance_inside  # noqa: E402
+from load import load  # noqa: E402
+from network import CHANNELS, HEIGHT, JAW, ON_JAWS, SHAPES, VIEWS, WIDTH, Reader  # noqa: E402
+from samples import MIRRORED, UNNUMBERED, UNTOLD, Sample, distance_inside, drawn_tissue  # noqa: E402
 from train import collate, crown_means, losses  # noqa: E402
+from train_tissue import loss as tissue_loss  # noqa: E402
 
 
 def sample(numbered: bool = True) -> Sample:
@@ -32,7 +34,10 @@ def sample(numbered: bool = True) -> Sample:
         image[y : y + 40, x : x + 35] = 150 + tooth
     numbers = teeth if numbered else np.where(teeth > 0, UNNUMBERED, 0).astype(np.uint8)
     told = np.ones_like(teeth)
-    return Sample("made", image, teeth, numbers, distance_inside(teeth), told, 0, 0)
+    tissue = np.zeros_like(teeth)
+    tissue[10:112, 30:125] = 1
+    tissue[:, 150:] = UNTOLD
+    return Sample("made", image, teeth, numbers, distance_inside(teeth), told, tissue, 0, 0)
 
 
 def test_mirrored_numbers_are_their_own_inverse() -> None:
@@ -110,7 +115,7 @@ def test_a_few_steps_learn_something() -> None:
         optimiser.zero_grad()
         total.backward()
         optimiser.step()
-        totals.append(float(total))
+        totals.append(total.item())
     assert totals[-1] < 0.9 * totals[0]
 
 
@@ -134,6 +139,67 @@ def test_opencv_runs_what_torch_learned(tmp_path: Path) -> None:
     )
     assert np.abs(maps - answer.numpy()).max() < 0.02 * np.abs(answer.numpy()).max()
     assert np.abs(views - kind.numpy()).max() < 0.02 * max(1, np.abs(kind.numpy()).max())
+
+
+def test_weights_come_back_from_the_file_that_ships(tmp_path: Path) -> None:
+    """Training can go on from it: it means the same, and is written the same."""
+    shipped = TOOLS.parents[1] / "stages" / "teeth" / "reader.onnx"
+    net = load(shipped)
+    (tmp_path / "again.onnx").write_bytes(to_onnx(net).SerializeToString(deterministic=True))
+    picture = torch.randn(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = net(picture)[0].numpy()
+    for file in (shipped, tmp_path / "again.onnx"):
+        runs = cv2.dnn.readNetFromONNX(str(file))
+        runs.setInput(picture.numpy())
+        assert np.abs(runs.forward("answer") - expected).max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_tissue_follows_every_change(seed: int) -> None:
+    """Crowns are tooth or gum, and beyond the picture nobody said anything."""
+    found = example(sample(), np.random.default_rng(seed))
+    assert set(np.unique(found.tissue)) <= {0, 1, UNTOLD}
+    assert (found.tissue[found.number > 0] == 1).mean() > 0.99
+    assert (found.tissue[found.valid == 0] == UNTOLD).mean() > 0.9
+    assert (found.tissue == 1).sum() > (found.number > 0).sum()
+
+
+def test_tissue_is_drawn_by_polygons_and_crowns() -> None:
+    crowns = np.zeros((100, 200), np.uint8)
+    crowns[40:60, 90:110] = 3
+    entry = {
+        "region": [[[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]]],
+        "not": [[[0.4, 0.3], [0.6, 0.3], [0.6, 0.7], [0.4, 0.7]]],
+        "unsure": [[[0.8, 0.0], [1.0, 0.0], [1.0, 0.3], [0.8, 0.3]]],
+    }
+    drawn = drawn_tissue(entry, crowns)
+    assert drawn[50, 30] == 1 and drawn[5, 5] == 0 and drawn[5, 190] == drawn[20, 170] == UNTOLD
+    assert drawn[35, 100] == 0 and drawn[50, 100] == 1  # a crown in what is something else
+
+
+def test_tissue_is_learned_without_a_change_to_anything_else() -> None:
+    torch.manual_seed(0)
+    net = Reader((8, 8, 16, 16, 16)).eval().requires_grad_(False)
+    net.tissue.train().requires_grad_(True)
+    batch = collate([example(sample(), np.random.default_rng(k)) for k in range(2)])
+    image, valid = batch["image"].float(), batch["valid"]
+    tissue = torch.from_numpy(
+        np.stack([example(sample(), np.random.default_rng(k)).tissue for k in range(2)])
+    )
+    before = net(image)[0].detach()
+    optimiser = torch.optim.AdamW(net.tissue.parameters(), 1e-2)
+    totals = []
+    for _ in range(6):
+        total = tissue_loss(net(image)[0][:, ON_JAWS], tissue, valid)
+        optimiser.zero_grad()
+        total.backward()
+        optimiser.step()
+        totals.append(total.item())
+    assert totals[-1] < 0.8 * totals[0]
+    assert torch.equal(net(image)[0][:, :ON_JAWS], before[:, :ON_JAWS])
+    nothing = torch.full_like(tissue, UNTOLD)
+    assert tissue_loss(before[:, ON_JAWS], nothing, valid) == 0
 
 
 def test_braces_are_drawn_onto_crowns_and_labels_stay() -> None:
@@ -197,4 +263,5 @@ def whole_row() -> Sample:
         teeth[62:104, x : x + 28] = (43, 42, 41, 31, 32, 33)[k]
     image = np.full((120, 200, 3), 200, np.uint8)
     inside = distance_inside(teeth)
-    return Sample("made", image, teeth, teeth, inside, np.ones_like(teeth), 0, 0)
+    told = np.ones_like(teeth)
+    return Sample("made", image, teeth, teeth, inside, told, np.full_like(told, UNTOLD), 0, 0)

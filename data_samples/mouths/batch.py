@@ -3,8 +3,8 @@
     python data_samples/mouths/__main__.py --count N --out FOLDER
         [--seed S] [--jobs J] [--patients WHOSE]
 
-Photograph k is `k.jpg`, with its labels (FDI numbers) in `k.png`; `index.json` says what
-each shows.
+Photograph k is `k.jpg`, with its labels in `k.png` (FDI numbers; 1: gum; 0: anything else);
+`index.json` says what each shows.
 The same seed gives the same bytes, with any number of jobs.
 """
 
@@ -31,6 +31,8 @@ PATIENTS = ("anybody", "orthodontic", "children")
 BRACES = 0.7
 #: Of the roles of `cameras.ROLES`.
 SHARES = (0.40, 0.22, 0.22, 0.08, 0.08)
+#: What gum is in the files of labels.
+GUM = np.uint8(1)
 
 
 def options_of(patients: str, rng: np.random.Generator) -> dict[str, Any]:
@@ -121,7 +123,8 @@ def main(arguments: list[str] | None = None) -> None:
         cv2.imwrite(
             str(options.out / f"{k}.jpg"), photo.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93]
         )
-        cv2.imwrite(str(options.out / f"{k}.png"), photo.labels)
+        labels = np.where(photo.gum & (photo.labels == 0), GUM, photo.labels)
+        cv2.imwrite(str(options.out / f"{k}.png"), labels)
         index[str(k)] = describe(mouth, photo)
         if (k + 1) % 50 == 0 or k + 1 == options.count:  # what is there can be used already
             (options.out / "index.json").write_text(json.dumps(index, indent=1) + "\n")

@@ -30,6 +30,7 @@ class Photograph:
     Attributes:
         image: [H, W, 3] uint8 sRGB.
         labels: [H, W] uint8 FDI number of the crown at the pixel's centre, 0 for anything else.
+        gum: [H, W] bool: gum of the jaws, or what is fixed to the teeth before it.
         depth: [H, W] float32 z-depth of the mouth, mm; 0 where it is hidden or absent.
         camera: the exact camera (`fx`, `fy`, `cx`, `cy`, `cam_from_world`).
         view: front, right, left, upper or lower.
@@ -39,6 +40,7 @@ class Photograph:
 
     image: npt.NDArray[np.uint8]
     labels: npt.NDArray[np.uint8]
+    gum: npt.NDArray[np.bool_]
     depth: npt.NDArray[np.float32]
     camera: Camera
     view: str
@@ -163,8 +165,8 @@ def look_along(stage: Stage, hit: dict[str, npt.NDArray[Any]], light: Light, eye
 
 def render(
     stage: Stage, camera: Camera, light: Light
-) -> tuple[Array, npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-    """Linear light [H, W, 3] (negative where there is nothing), labels and depth [H, W].
+) -> tuple[Array, npt.NDArray[np.uint8], npt.NDArray[np.bool_], npt.NDArray[np.float32]]:
+    """Linear light [H, W, 3] (negative where there is nothing), labels, gum and depth [H, W].
 
     Pixels at edges get four more rays.
     """
@@ -180,7 +182,10 @@ def render(
         bare = cast(stage.bare, rays)
     flat = np.zeros(len(rays), np.uint8)
     seen = np.isfinite(bare["t_hit"])
-    flat[seen] = stage.fdi[stage.triangles[bare["primitive_ids"][seen], 0]]
+    met = stage.triangles[bare["primitive_ids"][seen], 0]
+    flat[seen] = stage.fdi[met]
+    gum = np.zeros(len(rays), bool)
+    gum[seen] = stage.tissue[met] == Tissue.GUM
     depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32).reshape(height, width)
     labels = flat.reshape(height, width)
 
@@ -195,7 +200,7 @@ def render(
         more = look_along(stage, cast(stage.scene, camera.rays(pixels)), light, eye)
         total += np.maximum(more, 0) * (total >= 0) + np.minimum(more, 0) * (total < 0)
     picture[rows, columns] = total / 5
-    return picture, labels, depth
+    return picture, labels, gum.reshape(height, width), depth
 
 
 def defocus(
@@ -241,7 +246,7 @@ def photograph(mouth: Mouth, rng: np.random.Generator, role: str, **overrides: A
     plain = bool(overrides.get("plain", False))
     stage = set_stage(mouth, role, opening, rng)
     light = random_light(camera.cam_from_world, rng, plain)
-    picture, labels, depth = render(stage, camera, light)
+    picture, labels, gum, depth = render(stage, camera, light)
     picture = fill_back(picture, mouth, camera.fx / camera.cam_from_world[2, 3], role, rng)
     hidden = np.zeros(labels.shape, bool)
     if not plain:
@@ -250,6 +255,6 @@ def photograph(mouth: Mouth, rng: np.random.Generator, role: str, **overrides: A
         hidden = cover > 0.5
     labels, depth = np.where(hidden, 0, labels), np.where(hidden, 0, depth)
     return Photograph(
-        develop(picture, rng, plain), labels.astype(np.uint8), depth.astype(np.float32), camera,
-        role, bite, opening,
+        develop(picture, rng, plain), labels.astype(np.uint8), gum & ~hidden,
+        depth.astype(np.float32), camera, role, bite, opening,
     )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -88,6 +88,8 @@ class Dentition:
         jaws_apart: 0..1, how far the jaws are certainly not in contact.
         set_aside: why the photograph takes no part in the reconstruction; empty: it does.
         doubts: sentences for the user about what is not as expected; empty where all is well.
+        on_jaws: [K, 2] polygons around what is tooth or gum, and around holes in that; the rest is
+            lip, cheek, or what holds them. None: nobody told.
         mirrored: True: the photograph is a mirror image, and what is said here is of the picture
             turned back. False: a person said that it is none. None: nobody asked.
     """
@@ -102,6 +104,7 @@ class Dentition:
     jaws_apart: float = 0.0
     set_aside: str = ""
     doubts: tuple[str, ...] = ()
+    on_jaws: tuple[npt.NDArray[np.float64], ...] | None = None
     mirrored: bool | None = None
 
     def crowns(self, jaw: Jaw) -> tuple[Crown, ...]:
@@ -124,6 +127,13 @@ class Dentition:
     def mask(self) -> Bool:
         """[H, W] True on teeth."""
         return filled(self.all_crowns, self.size)
+
+    @cached_property
+    def on_jaws_mask(self) -> Bool:
+        """[H, W] True on teeth and gum by `on_jaws`; everywhere, where nobody told."""
+        if self.on_jaws is None:
+            return np.ones((self.size[1], self.size[0]), bool)
+        return filled_polygons(self.on_jaws, self.size) | self.mask
 
     @cached_property
     def above(self) -> Bool:
@@ -149,12 +159,27 @@ class Dentition:
 
 def filled(crowns: tuple[Crown, ...], size: tuple[int, int]) -> Bool:
     """[H, W] True inside the outlines of some crowns; size is width and height."""
-    mask = np.zeros((size[1], size[0]), np.uint8)
+    mask = np.zeros((size[1], size[0]), bool)
     for crown in crowns:
         if len(crown.outline) >= 3:
-            points = np.round((crown.outline - 0.5) * (1 << _SHIFT)).astype(np.int32)
-            cv2.fillPoly(mask, [points], 1, cv2.LINE_8, _SHIFT)
+            mask |= filled_polygons((crown.outline,), size)
+    return mask
+
+
+def filled_polygons(polygons: tuple[npt.NDArray[np.float64], ...], size: tuple[int, int]) -> Bool:
+    """[H, W] True inside an odd number of polygons [K, 2]; size is width and height."""
+    mask = np.zeros((size[1], size[0]), np.uint8)
+    points = [np.round((p - 0.5) * (1 << _SHIFT)).astype(np.int32) for p in polygons]
+    cv2.fillPoly(mask, points, 1, cv2.LINE_8, _SHIFT)
     return mask > 0
+
+
+def moved_polygons(
+    polygons: tuple[npt.NDArray[np.float64], ...] | None,
+    move: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]],
+) -> tuple[npt.NDArray[np.float64], ...] | None:
+    """Polygons [K, 2] elsewhere; None stays None."""
+    return None if polygons is None else tuple(move(polygon) for polygon in polygons)
 
 
 @dataclass(frozen=True)
@@ -209,6 +234,9 @@ def _view_entry(view: Dentition) -> dict[str, Any]:
         "set_aside": view.set_aside,
         "doubts": list(view.doubts),
         "mirrored": view.mirrored,
+        "on_jaws": None
+        if view.on_jaws is None
+        else [np.round(polygon, _DECIMALS).tolist() for polygon in view.on_jaws],
         "crowns": [_crown_entry(crown) for crown in view.all_crowns],
     }
 
@@ -250,6 +278,9 @@ def _view(entry: Mapping[str, Any]) -> Dentition:
         jaws_apart=entry["jaws_apart"],
         set_aside=entry["set_aside"],
         doubts=tuple(entry["doubts"]),
+        on_jaws=None
+        if entry.get("on_jaws") is None
+        else tuple(np.array(polygon, np.float64) for polygon in entry["on_jaws"]),
         mirrored=entry.get("mirrored"),
     )
 

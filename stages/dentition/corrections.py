@@ -18,7 +18,7 @@ from pipeline.artifacts.dental.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
-from stages.dentition.crowns import centroid, dentition_of, mirrored_dentition, outline_of
+from stages.dentition.crowns import centroid, mirrored_dentition, outline_of, with_outlines
 from stages.dentition.parts import perhaps_one
 
 Array = npt.NDArray[np.float64]
@@ -107,17 +107,15 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
         raise RequestError(
             f"{where}: use is true, but no tooth was found in this photograph. Leave it out."
         )
+    corrected = replace(dentition, kind=kind, set_aside=set_aside)
     if moved:
-        corrected = dentition_of(
-            [outline_of(crown) for crown in crowns], dentition.name, dentition.size, kind,
-            roll=dentition.roll, set_aside=set_aside, doubts=dentition.doubts,
-        )  # fmt: skip
+        corrected = with_outlines(corrected, [outline_of(crown) for crown in crowns])
     else:
         corrected = replace(
-            dentition, kind=kind, set_aside=set_aside,
+            corrected,
             upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
             lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
-        )  # fmt: skip
+        )
     if not mirrored:
         return replace(corrected, mirrored=mirrored)
     turned = mirrored_dentition(corrected)

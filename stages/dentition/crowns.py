@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, Jaw, other_side
-from pipeline.artifacts.teeth import Crown, Dentition
+from pipeline.artifacts.teeth import Crown, Dentition, moved_polygons
 
 Array = npt.NDArray[np.float64]
 
@@ -104,6 +104,15 @@ def dentition_of(
     )
 
 
+def with_outlines(dentition: Dentition, outlines: Sequence[Outline]) -> Dentition:
+    """A photograph whose crowns have become others: all else is kept, landmarks are found again."""
+    made = dentition_of(
+        outlines, dentition.name, dentition.size, dentition.kind, roll=dentition.roll,
+        set_aside=dentition.set_aside, doubts=dentition.doubts,
+    )  # fmt: skip
+    return replace(made, on_jaws=dentition.on_jaws, mirrored=dentition.mirrored)
+
+
 def mirrored_dentition(dentition: Dentition) -> Dentition:
     """The teeth in the picture turned over: those of a mirror image as they are.
 
@@ -116,6 +125,7 @@ def mirrored_dentition(dentition: Dentition) -> Dentition:
         upper=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.upper)),
         lower=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.lower)),
         roll=-dentition.roll,
+        on_jaws=moved_polygons(dentition.on_jaws, lambda polygon: _turned_over(polygon, width)),
         mirrored=True,
     )
 
@@ -137,10 +147,14 @@ def _mirrored_crown(crown: Crown, width: int) -> Crown:
         embrasure_right=over(crown.embrasure_left),
         cut_left=crown.cut_right,
         cut_right=crown.cut_left,
-        outline=(np.array([width, 0.0]) + crown.outline * [-1.0, 1.0])[::-1],
+        outline=_turned_over(crown.outline, width),
         numbers={other_side(tooth): share for tooth, share in crown.numbers.items()},
         number=other_side(crown.number) if guessed else crown.number,
     )
+
+
+def _turned_over(polygon: Array, width: int) -> Array:
+    return (np.array([width, 0.0]) + polygon * [-1.0, 1.0])[::-1]
 
 
 def centroid(polygon: Array) -> Array:

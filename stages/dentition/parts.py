@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.dentition.crowns import GAP, Outline, dentition_of, outline_of
+from stages.dentition.crowns import GAP, Outline, outline_of, with_outlines
 from stages.dentition.tooth_rows import LOOKS, crown_evidence
 
 Array = npt.NDArray[np.float64]
@@ -62,11 +62,7 @@ def joined_parts(dentition: Dentition, rows: Sequence[Sequence[int]]) -> Dentiti
         outlines += mine
     if not changed:
         return dentition
-    made = dentition_of(
-        outlines, dentition.name, dentition.size, dentition.kind, roll=dentition.roll,
-        set_aside=dentition.set_aside, doubts=dentition.doubts,
-    )  # fmt: skip
-    return replace(made, mirrored=dentition.mirrored)
+    return with_outlines(dentition, outlines)
 
 
 def _joined(first: Outline, second: Outline) -> Outline:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.teeth import Crown, Dentition
+from pipeline.artifacts.teeth import Crown, Dentition, moved_polygons
 from pipeline.artifacts.views import View, to_uint8
 
 Array = npt.NDArray[np.float64]
@@ -91,6 +91,7 @@ def resized_dentition(dentition: Dentition, size: tuple[int, int]) -> Dentition:
         size=size,
         upper=tuple(resized(crown) for crown in dentition.upper),
         lower=tuple(resized(crown) for crown in dentition.lower),
+        on_jaws=moved_polygons(dentition.on_jaws, moved),
         band_height=float(moved(np.array([0.0, dentition.band_height]))[1]),
     )
 

@@ -30,7 +30,7 @@ _MEAN, _SPREAD = 0.45, 0.25
 _TOOTH, _INSIDE, _CENTRE, _BORDER = 0, 1, slice(2, 4), 4
 #: Unit of the way to a crown's centre, pixels of the answer.
 _CENTRE_UNIT = np.float32(16)
-_JAW, _SIDE, _PRIMARY, _POSITION = 5, 6, 7, slice(8, 16)
+_JAW, _SIDE, _PRIMARY, _POSITION, _ON_JAWS = 5, 6, 7, slice(8, 16), 16
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Answer:
         border: [h, w] 0..1: two crowns touch here.
         lower, left, primary: [h, w] logits: of the lower jaw, the patient's left, a primary tooth.
         position: [8, h, w] log probability of the place in the quadrant, from the midline.
+        on_jaws: [h, w] logit of being tooth or gum; lips, cheeks, and what holds them are not.
         kind: [6] log probability of `KINDS`.
         apart: logit of the jaws being apart.
         answer_from_image: [2, 3] from pixels of the photograph to those of the maps.
@@ -57,6 +58,7 @@ class Answer:
     left: Array
     primary: Array
     position: Array
+    on_jaws: Array
     kind: Array
     apart: float
     answer_from_image: Transform
@@ -110,9 +112,10 @@ def look(image: Array, valid: npt.NDArray[np.bool_], transform: Transform, flip:
         maps = half * (maps + other)
         kind = half * (kind + other_kind[[0, 2, 1, 3, 4, 5, 6]])
     answer_from_image = transform * 0.5
-    tooth = np.where(seen[::2, ::2] > 0, maps[_TOOTH], -20).astype(np.float32)
+    unseen = seen[::2, ::2] == 0
+    maps[_TOOTH, unseen] = maps[_ON_JAWS, unseen] = -20
     return Answer(
-        tooth=tooth,
+        tooth=maps[_TOOTH],
         inside=_sigmoid(maps[_INSIDE]),
         centre=maps[_CENTRE] * _CENTRE_UNIT,
         border=_sigmoid(maps[_BORDER]),
@@ -120,6 +123,7 @@ def look(image: Array, valid: npt.NDArray[np.bool_], transform: Transform, flip:
         left=maps[_SIDE],
         primary=maps[_PRIMARY],
         position=_log_softmax(maps[_POSITION]),
+        on_jaws=maps[_ON_JAWS],
         kind=_log_softmax(kind[: len(KINDS)]),
         apart=float(kind[len(KINDS)]),
         answer_from_image=answer_from_image,
@@ -127,11 +131,11 @@ def look(image: Array, valid: npt.NDArray[np.bool_], transform: Transform, flip:
 
 
 def _forward(picture: Array) -> tuple[Array, Array]:
-    """[16, h, w] and [7] for one picture [1, 3, HEIGHT, WIDTH]."""
+    """[17, h, w] and [7] for one picture [1, 3, HEIGHT, WIDTH]."""
     network = _network()
     network.setInput(picture)
     maps, kind = network.forward(["answer", "kind"])
-    return np.asarray(maps[0], np.float32), np.asarray(kind[0], np.float32)
+    return np.array(maps[0], np.float32), np.asarray(kind[0], np.float32)
 
 
 def _sigmoid(x: Array) -> Array:

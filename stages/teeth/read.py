@@ -21,6 +21,7 @@ from stages.dentition.tooth_rows import (
 from stages.teeth.instances import Found, find_crowns
 from stages.teeth.network import HEIGHT, KINDS, WIDTH, Answer, Transform, fitted, look
 from stages.teeth.numbers import looks
+from stages.teeth.tissue import on_jaws
 
 Array32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
@@ -93,7 +94,9 @@ def read_photograph(
         return Reading(Dentition(name, size, "none"), kinds, apart)
     likely = max(kinds, key=lambda k: kinds[k])
     outlines = _outlines(crowns)
-    dentition = dentition_of(outlines, name, size, likely)
+    dentition = replace(
+        dentition_of(outlines, name, size, likely), on_jaws=on_jaws([first, answer], size)
+    )
     return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
 
 

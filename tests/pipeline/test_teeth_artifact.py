@@ -183,6 +183,29 @@ def test_teeth_of_which_nobody_said_whether_they_are_mirrored(tmp_path: Path) ->
     assert Teeth.load(tmp_path).views[0].mirrored is None
 
 
+def test_teeth_and_gum_are_told_from_lips(tmp_path: Path) -> None:
+    """Inside one outline, and not in a hole of it; a crown in the hole is tooth all the same."""
+    told = replace(dentition(), on_jaws=(box(10, 5, 60, 70), box(15, 38, 40, 30)))
+    expected = np.zeros((HEIGHT, WIDTH), bool)
+    expected[5:75, 10:70] = True
+    expected[38:68, 15:55] = False
+    rim = np.zeros_like(expected)  # of the hole: on its own border a polygon counts as inside
+    rim[37:69, 14:56] = True
+    rim[40:66, 17:53] = False
+    expected |= told.mask
+    np.testing.assert_array_equal(told.on_jaws_mask[~rim], expected[~rim])
+    Teeth((told,)).save(tmp_path)
+    np.testing.assert_array_equal(Teeth.load(tmp_path).views[0].on_jaws_mask, told.on_jaws_mask)
+
+
+def test_where_nobody_told_all_may_be_gum(tmp_path: Path) -> None:
+    assert dentition().on_jaws_mask.all()
+    nothing = replace(dentition(), on_jaws=())
+    np.testing.assert_array_equal(nothing.on_jaws_mask, nothing.mask)
+    Teeth((nothing, dentition())).save(tmp_path)
+    assert [view.on_jaws for view in Teeth.load(tmp_path).views] == [(), None]
+
+
 def test_nothing_is_a_dentition_too(tmp_path: Path) -> None:
     empty = Dentition("000", (30, 20), "none")
     assert not empty.mask.any()

@@ -25,7 +25,8 @@ def row_of_teeth():
         for jaw in ("upper", "lower")
         for k in range(3)
     ]
-    return dentition_of(outlines, "000", SIZE, "front")
+    gum = np.array([[30.111, 60.333], [300.457, 70.2], [290.9, 330.05], [25.0, 310.77]])
+    return replace(dentition_of(outlines, "000", SIZE, "front"), on_jaws=(gum,))
 
 
 def written(dentition, folder):
@@ -52,6 +53,8 @@ def test_teeth_are_enlarged_with_the_photograph():
     large = resized_dentition(small, (1024, 768))
     assert large.mask.shape == (768, 1024)
     assert large.mask.sum() == pytest.approx(4 * small.mask.sum(), rel=0.05)
+    share = large.on_jaws_mask.mean() / small.on_jaws_mask.mean()
+    assert share == pytest.approx(1, rel=0.02)
     assert large.band_height == pytest.approx(2 * small.band_height, abs=0.02)
 
 

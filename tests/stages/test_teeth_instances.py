@@ -41,7 +41,8 @@ def answer(
     }
     return Answer(
         **{name: np.asarray(values, np.float32) for name, values in maps.items()},
-        kind=np.zeros(6, np.float32), apart=0.0, answer_from_image=np.eye(2, 3),
+        on_jaws=maps["tooth"], kind=np.zeros(6, np.float32), apart=0.0,
+        answer_from_image=np.eye(2, 3),
     )  # fmt: skip
 
 

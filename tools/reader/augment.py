@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from brackets import draw_braces
 from network import CENTRE_UNIT, HEIGHT, WIDTH
-from samples import MIRRORED, UNNUMBERED, Sample
+from samples import MIRRORED, UNNUMBERED, UNTOLD, Sample
 
 Array = npt.NDArray[np.float32]
 #: Brightness 0..1 is brought to about zero mean and unit spread.
@@ -30,6 +30,7 @@ class Example:
         crowns: [h, w] uint8 one number per crown, 0: no tooth.
         number: [h, w] uint8 FDI, `UNNUMBERED` or 0.
         valid: [h, w] float32: inside the photograph, where the labels say something.
+        tissue: [h, w] uint8, as in `Sample`.
         view, bite: as in `Sample`.
     """
 
@@ -41,6 +42,7 @@ class Example:
     crowns: npt.NDArray[np.uint8]
     number: npt.NDArray[np.uint8]
     valid: Array
+    tissue: npt.NDArray[np.uint8]
     view: int
     bite: int
 
@@ -165,6 +167,7 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
     ones = np.ones(shape, np.uint8)
     seen = cv2.warpAffine(ones, whole, size, flags=cv2.INTER_NEAREST)
     told = cv2.warpAffine(sample.told, half, small, flags=cv2.INTER_NEAREST)
+    tissue = cv2.warpAffine(sample.tissue, half, small, flags=cv2.INTER_NEAREST, borderValue=UNTOLD)
     view, bite = sample.view, sample.bite
     if rng is not None:
         image = np.ascontiguousarray(image)
@@ -173,17 +176,20 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
         image = _relit(image, rng)
         if rng.random() < 0.15:
             hidden = cv2.resize(_probe(image, rng), small, interpolation=cv2.INTER_AREA) > 0
-            tooth[hidden], inside[hidden], number[hidden], crowns[hidden] = 0, 0, 0, 0
+            for part in (tooth, inside, number, crowns):
+                part[hidden] = 0
+            tissue[hidden & (tissue != UNTOLD)] = 0
     if flip:
-        image, inside, crowns, tooth, seen, told = (
+        image, inside, crowns, tooth, seen, told, tissue = (
             np.ascontiguousarray(part[:, ::-1])
-            for part in (image, inside, crowns, tooth, seen, told)
+            for part in (image, inside, crowns, tooth, seen, told, tissue)
         )
         number = MIRRORED[number[:, ::-1]]
         view = {1: 2, 2: 1}.get(view, view)
     if rng is not None and rng.random() < 0.08:
-        image, inside, crowns, tooth, seen, told = (
-            np.ascontiguousarray(part[::-1]) for part in (image, inside, crowns, tooth, seen, told)
+        image, inside, crowns, tooth, seen, told, tissue = (
+            np.ascontiguousarray(part[::-1])
+            for part in (image, inside, crowns, tooth, seen, told, tissue)
         )
         number = np.where(number[::-1] > 0, UNNUMBERED, 0).astype(np.uint8)
         view = bite = -1
@@ -197,6 +203,7 @@ def example(sample: Sample, rng: np.random.Generator | None) -> Example:
         crowns=np.ascontiguousarray(crowns),
         number=np.ascontiguousarray(number),
         valid=(seen[::2, ::2] * told).astype(np.float32),
+        tissue=tissue,
         view=view,
         bite=bite,
     )

@@ -15,6 +15,9 @@ from network import CHANNELS, HEIGHT, VIEWS, WIDTH, Reader, Residual, Wide
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+#: Names of weights in half precision begin so.
+HALF = "half"
+
 
 class Graph:
     """Collects nodes and weights."""
@@ -35,8 +38,8 @@ class Graph:
         """Append a weight, in half precision; returns its name in single precision."""
         self._count += 1
         array = values.detach().numpy().astype(np.float16)
-        self.weights.append(numpy_helper.from_array(array, f"half{self._count}"))
-        return self.add("Cast", [f"half{self._count}"], to=TensorProto.FLOAT)
+        self.weights.append(numpy_helper.from_array(array, f"{HALF}{self._count}"))
+        return self.add("Cast", [f"{HALF}{self._count}"], to=TensorProto.FLOAT)
 
     def constant(self, values: list[float], kind: type = np.float32) -> str:
         """Append a small constant; returns its name."""
@@ -89,9 +92,9 @@ class Graph:
         return x
 
 
-def to_onnx(net: Reader) -> onnx.ModelProto:
+def to_onnx(net: Reader, graph: Graph | None = None) -> onnx.ModelProto:
     """The network as an ONNX graph of plain operations."""
-    graph = Graph()
+    graph = graph or Graph()
     levels = [graph.block("image", net.stem)]
     for down in net.down:
         levels.append(graph.block(levels[-1], down))
@@ -107,7 +110,15 @@ def to_onnx(net: Reader) -> onnx.ModelProto:
         grown.append(y)
     far, near = graph.doubled(graph.block(grown[1], net.far)), graph.block(grown[2], net.near)
     meaning = graph.block(graph.add("Add", [far, near]), net.meaning)
-    y = graph.add("Concat", [graph.block(y, net.shape), graph.doubled(meaning)], axis=1)
+    shape = graph.block(y, net.shape)
+    far, near = (
+        graph.doubled(graph.block(grown[1], net.tissue.far)),
+        graph.block(grown[2], net.tissue.near),
+    )
+    join = graph.block(graph.add("Add", [far, near]), net.tissue.join)
+    here = graph.block(y, net.tissue.here)
+    tissue = graph.block(graph.add("Add", [graph.doubled(join), here]), net.tissue.last)
+    y = graph.add("Concat", [shape, graph.doubled(meaning), tissue], axis=1)
     graph.nodes.append(helper.make_node("Identity", [y], ["answer"], "answer"))
     graph.nodes.append(helper.make_node("Flatten", [kind], ["kind"], "kind"))
     model = helper.make_model(

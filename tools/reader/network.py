@@ -12,12 +12,13 @@ from torch.nn import functional as F  # noqa: N812
 
 WIDTH, HEIGHT = 448, 320
 #: The answer's channels, in order. Positions run from the central incisor (1) to the third molar.
-#: Shape first, then what tooth it is. The border is where two crowns touch.
-TOOTH, INSIDE, CENTRE, BORDER, JAW, SIDE, PRIMARY, POSITION = (
-    0, 1, slice(2, 4), 4, 5, 6, 7, slice(8, 16),
+#: Shape first, then what tooth it is. The border is where two crowns touch. Last, whether it is
+#: tooth or gum, and not lip, cheek, or what holds them.
+TOOTH, INSIDE, CENTRE, BORDER, JAW, SIDE, PRIMARY, POSITION, ON_JAWS = (
+    0, 1, slice(2, 4), 4, 5, 6, 7, slice(8, 16), 16,
 )  # fmt: skip
 SHAPES, MEANINGS = 5, 11
-CHANNELS = SHAPES + MEANINGS
+CHANNELS = SHAPES + MEANINGS + 1
 #: What kind of photograph it is, and (last) whether the jaws are apart.
 VIEWS = ("front", "right", "left", "upper", "lower", "other")
 #: Pixels of the answer in which offsets to the crown's centre are counted.
@@ -63,8 +64,27 @@ class Wide(nn.Module):
         return F.relu(x + self.join(self.mix(self.spread(x))))
 
 
+class Tissue(nn.Module):
+    """Is it tooth or gum? Read off what the reader has found, from near and far around.
+
+    It is learned last (`train_tissue.py`), and changes nothing of the rest.
+    """
+
+    def __init__(self, eighth: int, quarter: int, half: int, width: int = 32) -> None:
+        super().__init__()
+        self.far = nn.Sequential(convolution(eighth, width, size=1), Wide(width, 9), Wide(width, 9))
+        self.near = nn.Conv2d(quarter, width, 1)
+        self.join = Residual(width)
+        self.here = nn.Conv2d(half, width, 1)
+        self.last = nn.Sequential(Residual(width), nn.Conv2d(width, 1, 1))
+
+    def forward(self, eighth: Tensor, quarter: Tensor, half: Tensor) -> Tensor:
+        y = self.join(doubled(self.far(eighth)) + self.near(quarter))
+        return self.last(doubled(y) + self.here(half))
+
+
 class Reader(nn.Module):
-    """[N, 3, HEIGHT, WIDTH] normalised RGB -> ([N, 16, HEIGHT/2, WIDTH/2], [N, 7]).
+    """[N, 3, HEIGHT, WIDTH] normalised RGB -> ([N, 17, HEIGHT/2, WIDTH/2], [N, 7]).
 
     Which tooth it is, is told at an eighth and a quarter of the size, with more channels and a
     wider view than the outlines need.
@@ -94,6 +114,7 @@ class Reader(nn.Module):
         self.near = nn.Conv2d(b, meaning, 1)
         self.meaning = nn.Sequential(Residual(meaning), nn.Conv2d(meaning, MEANINGS, 1))
         self.kind = nn.Conv2d(e, len(VIEWS) + 1, 1)
+        self.tissue = Tissue(c, b, a)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         levels = [self.stem(x)]
@@ -108,7 +129,8 @@ class Reader(nn.Module):
             y = up(doubled(narrow(y)) + levels.pop())
             grown.append(y)
         meaning = self.meaning(doubled(self.far(grown[1])) + self.near(grown[2]))
-        return torch.cat([self.shape(y), doubled(meaning)], 1), kind
+        tissue = self.tissue(grown[1], grown[2], y)
+        return torch.cat([self.shape(y), doubled(meaning), tissue], 1), kind
 
 
 def doubled(x: Tensor) -> Tensor:

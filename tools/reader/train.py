@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import torch
 from augment import Example, example
+from load import load
 from network import (
     BORDER,
     CENTRE,
@@ -112,7 +113,7 @@ def crown_means(answer: Tensor, batch: dict[str, Tensor]) -> tuple[Tensor, Tenso
     place = batch["crowns"].long() + 256 * torch.arange(count, device=device)[:, None, None]
     place = place[on_crown]
     weight = batch["inside"][on_crown] + 1e-3
-    logits = answer[:, SHAPES:].permute(0, 2, 3, 1)[on_crown]
+    logits = answer[:, SHAPES : SHAPES + MEANINGS].permute(0, 2, 3, 1)[on_crown]
     logits = torch.cat([logits, torch.ones_like(logits[:, :1])], 1) * weight[:, None]
     sums = torch.zeros(256 * count, MEANINGS + 1, device=device).index_add(0, place, logits)
     pixels = torch.bincount(place, minlength=256 * count)
@@ -240,12 +241,13 @@ def main() -> None:
         )
     )  # fmt: skip
     check = {name: part.to(device) for name, part in check.items()}
-    net = Reader().to(device, memory_format=torch.channels_last)
+    net = load(arguments.start).train() if arguments.start else Reader()
+    net = net.to(device, memory_format=torch.channels_last)
+    net.tissue.requires_grad_(False)  # `train_tissue.py` teaches it
     print(f"{sum(p.numel() for p in net.parameters()) / 1e6:.2f} million weights", flush=True)
-    if arguments.start:
-        net.load_state_dict(torch.load(arguments.start, map_location=device, weights_only=True))
     average = copy.deepcopy(net).eval()
-    optimiser = torch.optim.AdamW(net.parameters(), arguments.rate, weight_decay=0.02)
+    learning = [part for part in net.parameters() if part.requires_grad]
+    optimiser = torch.optim.AdamW(learning, arguments.rate, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, arguments.rate, total_steps=arguments.steps, pct_start=0.1
     )
@@ -259,7 +261,7 @@ def main() -> None:
         total = sum(parts.values())
         optimiser.zero_grad()
         total.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
+        torch.nn.utils.clip_grad_norm_(learning, 2.0)
         optimiser.step()
         schedule.step()
         # A mean of the last steps' weights reads better than the last step's.
