@@ -152,6 +152,12 @@ def outline(mask: np.ndarray) -> np.ndarray:
     return np.concatenate([c[:, 0] + 0.5 for c in contours])
 
 
+def pieces(mask: np.ndarray) -> tuple[np.ndarray, ...]:
+    """[K, 2] polygons around what a mask shows, and around its holes."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return tuple(contour[:, 0] + 0.5 for contour in contours)
+
+
 def scene(yaws=(-40.0, 0.0, 40.0), missing=None, exposures=(0.9, 1.0, 1.0)):  # type: ignore[no-untyped-def]
     """Images, valid masks, dentitions, fit; and exact depth, jaw and kind maps.
 
@@ -180,7 +186,9 @@ def scene(yaws=(-40.0, 0.0, 40.0), missing=None, exposures=(0.9, 1.0, 1.0)):  # 
             crowns[model.jaw] = (whole, *(crown,) * (len(facing) - 1))
             names[model.jaw] = tuple(facing)
         size = (WIDTH, HEIGHT)
-        dentitions.append(Dentition("", size, "other", crowns["upper"], crowns["lower"], 0.0, 50.0))
+        rows = crowns["upper"], crowns["lower"]
+        on_jaws = pieces((kind == 1) | (kind == 2))
+        dentitions.append(Dentition("", size, "other", *rows, 0.0, 50.0, on_jaws=on_jaws))
         placed.append(
             PlacedView(pose, FOCAL, roles.get(yaw, "between"), names["upper"], names["lower"], 0.5)
         )

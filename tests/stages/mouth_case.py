@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -29,6 +29,7 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.crowns import Outline, dentition_of
+from tests.stages.dental_arch_scene import pieces
 
 WIDTH, HEIGHT = 512, 384
 #: A wrong number is none if this much doubt is said beside it.
@@ -65,11 +66,14 @@ class Case:
     def dentitions(self, **looks: Any) -> list[Dentition]:
         """Exact outlines of every photograph, put in order as the reader's are."""
         return [
-            dentition_of(
-                outlines_of(photo.labels, **looks),
-                f"{k:03d}",
-                (photo.image.shape[1], photo.image.shape[0]),
-                photo.view,
+            replace(
+                dentition_of(
+                    outlines_of(photo.labels, **looks),
+                    f"{k:03d}",
+                    (photo.image.shape[1], photo.image.shape[0]),
+                    photo.view,
+                ),
+                on_jaws=pieces(photo.gum | (photo.labels > 0)),
             )
             for k, photo in enumerate(self.photos)
         ]

@@ -13,7 +13,7 @@ from pipeline.artifacts.confidence import FILLED, MEASURED
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import said_by_cameras
-from pipeline.artifacts.teeth import Dentition
+from pipeline.artifacts.teeth import Dentition, moved_polygons
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
@@ -65,7 +65,7 @@ ROUNDS = (
 )
 #: Matches that are seen at a low angle (cosine) are still worth more than none. Gum may be further
 #: from the usual colour: what is no gum at all does not match.
-LEAST_FACING, GUM_DEVIATIONS = 0.2, 5.0
+LEAST_FACING = 0.2
 #: Where no photographs agree, the charts are still mm and not cm off, unlike what is filled in
 #: around them: a guess, half way from `FILLED` to `MEASURED` (confidence is 1 + exp of this).
 GUESS = float(np.log((FILLED + MEASURED) / 2 - 1))
@@ -175,7 +175,7 @@ def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -
     ]
     surface = replace(
         surface_options(config.dental), gum_trust=GUM_TRUST, guess=GUESS, rounds=ROUNDS,
-        least_facing=LEAST_FACING, least_showing=LEAST_FACING / 2, gum_deviations=GUM_DEVIATIONS,
+        least_facing=LEAST_FACING, least_showing=LEAST_FACING / 2,
         carve=True, only_clear=False,
     )  # fmt: skip
     if config.dental.gum_height is None:
@@ -189,15 +189,16 @@ def _mirrored(dentition: Dentition | None) -> bool:
 
 def moved(dentition: Dentition, centred: CentredView) -> Dentition:
     """A photograph's crowns in the pixels of the picture that was made of it."""
+
+    def shown(polygon: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.array([centred.point(float(x), float(y)) for x, y in polygon])
+
     outlines = [
-        replace(
-            outline_of(crown),
-            polygon=np.array([centred.point(float(x), float(y)) for x, y in crown.outline]),
-        )
-        for crown in dentition.all_crowns
+        replace(outline_of(crown), polygon=shown(crown.outline)) for crown in dentition.all_crowns
     ]
     size = (centred.view.width, centred.view.height)
-    return dentition_of(outlines, dentition.name, size, dentition.kind, dentition.roll)
+    made = dentition_of(outlines, dentition.name, size, dentition.kind, dentition.roll)
+    return replace(made, on_jaws=moved_polygons(dentition.on_jaws, shown))
 
 
 def _write(

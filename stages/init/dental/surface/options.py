@@ -78,8 +78,6 @@ class SurfaceOptions:
     grow_round: SweepRound = SweepRound(reach=4.0, step=0.15, window=1.6, prior=0.1, stiffness=8.0)
     # weight of what photographs agree on there, against 1 on the crowns
     gum_trust: float = 0.2
-    # a pixel is gum if its colour is within so many standard deviations of that beside the crowns
-    gum_deviations: float = 3.5
     # confidence where no photographs agree is 1 + exp(this): more than what is completed has
     guess: float = -1.6
     # rims are smoothed over this length

@@ -13,9 +13,10 @@ from pipeline.artifacts.teeth import Dentition
 from stages.init.dental.solution import PlacedView
 from stages.init.dental.surface.photos.tissue import (
     eight_bit_lab,
-    find_gum,
     find_hardware,
     find_void,
+    joined_to,
+    without_small_holes,
 )
 from stages.stereo.appearance import highlights
 
@@ -48,7 +49,7 @@ class Photo:
         upper_gum, lower_gum: [H, W] float32 0 or 1: gum of this jaw.
         dull: [H, W] float32: 1, and 0 in highlights.
         void: [H, W] float32 0 or 1: so dark that nothing can be there, near or far.
-        covered: [H, W] float32 0 or 1: something stands before the teeth and the gum.
+        covered: [H, W] float32 0 or 1: lip, cheek, or what holds them may hide teeth and gum.
         hardware: [H, W] float32 0..1: how sure it is metal that is fixed to the crowns.
         valid: [H, W] bool.
     """
@@ -161,7 +162,6 @@ def prepare_photo(
     dentition: Dentition,
     placed: PlacedView,
     middle: Array64,
-    gum_deviations: float,
 ) -> Photo:
     """Prepare one photograph.
 
@@ -172,7 +172,6 @@ def prepare_photo(
         dentition: its teeth.
         placed: its camera.
         middle: [3] a point amid the teeth, mm.
-        gum_deviations: see `SurfaceOptions`.
 
     Raises:
         ValueError: arrays of different size.
@@ -196,8 +195,8 @@ def prepare_photo(
     lab = eight_bit_lab(image)
     tooth = dentition.mask & valid
     void = find_void(lab[..., 0], tooth, density)
-    shiny = highlights(image)
-    gum = find_gum(lab, tooth, shiny > 0, dentition, density, gum_deviations) & valid & ~void
+    on_jaws = without_small_holes(dentition.on_jaws_mask, density) & valid & ~void
+    gum = joined_to(on_jaws | tooth, tooth) & ~tooth
     return Photo(
         index=index,
         camera=camera,
@@ -209,9 +208,9 @@ def prepare_photo(
         lower=(tooth & ~dentition.above).astype(np.float32),
         upper_gum=(gum & dentition.above).astype(np.float32),
         lower_gum=(gum & ~dentition.above).astype(np.float32),
-        dull=(1 - shiny).astype(np.float32),
+        dull=(1 - highlights(image)).astype(np.float32),
         void=(void & valid).astype(np.float32),
-        covered=np.zeros((height, width), np.float32),
+        covered=(valid & ~(on_jaws | tooth | void)).astype(np.float32),
         hardware=find_hardware(lab, tooth, density),
         valid=valid,
     )
