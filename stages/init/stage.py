@@ -25,7 +25,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 34
+    version = 35
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -112,6 +112,28 @@ def test_what_all_photographs_see_at_a_low_angle_has_no_depth(only_clear: bool) 
     assert shown[away].mean() < 0.15 if only_clear else shown[away].mean() > 0.5
 
 
+def test_what_a_better_facing_photograph_does_not_show_needs_a_good_angle() -> None:
+    """The last crown on the right, drawn out in the frontal photograph: is it seen from the right?
+
+    The arch turns to 60 degrees from the frontal line of sight within it.
+    """
+    images, valid, dentitions, fit, truth = scene()
+    ends = angles(truth[0][0], fit.views[0].cam_from_world) < END
+    cut = [valid[0] & ~ends, *valid[1:]]
+    options = SurfaceOptions(rounds=())
+    whole, short = (
+        dense_surface(images, usable, dentitions, fit, options).views[1].depth > 0
+        for usable in (valid, cut)
+    )
+    depth, _, kind = truth[1]
+    angle = angles(depth, fit.views[1].cam_from_world)
+    drawn_out, clear = (kind == 2) & (angle < -1.0), (kind == 2) & (angle > -0.9)
+    assert drawn_out.sum() > 20
+    assert whole[drawn_out].mean() > 0.95
+    assert short[drawn_out].mean() < 0.2
+    assert short[clear].mean() > 0.98
+
+
 def test_a_scrap_smaller_than_a_tooth_and_its_gum_is_none_of_the_surface() -> None:
     """The largest piece stays, however small, and so does another with room for a tooth."""
     row, tooth, scrap = (np.zeros((60, 400), bool) for _ in range(3))

@@ -55,6 +55,8 @@ class SurfaceOptions:
     least_facing: float = 0.25
     # a view says what is tooth and what is gum from this cosine: below it shows them drawn out
     least_showing: float = 0.35
+    # the same where another view faces them better: half their width is left
+    least_beside: float = 0.5
     # whether what no view sees from there has no depth; with exact cameras it is right all the same
     only_clear: bool = True
     # pairs of views closer or further apart (degrees) are not compared

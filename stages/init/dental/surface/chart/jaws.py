@@ -40,6 +40,9 @@ HIDDEN = 0.8
 _SURE = 2.0
 #: Smoothing of the normals that are given out, and of those that decide what faces a view (mm).
 _NORMAL_SMOOTHING, FACING_SMOOTHING = 0.15, 1.5
+#: And of those that decide how a photograph faces the row, not each side of its crowns: half a
+#: tooth.
+_ROW_SMOOTHING = 4.5
 #: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
 #: move with the camera.
 _GUM_FADES = (0.5, 2.0)
@@ -190,15 +193,20 @@ def clearly_seen(
 ) -> Mask:
     """[H, W] bool: samples of a chart that some photograph shows, and not at too low an angle.
 
+    Where another photograph faces the row better and yet does not show it, because it ends there or
+    a lip is before it, the angle must be better: what is left beyond is drawn out, and in crumbs.
     Pieces too small for a tooth and its gum are left out.
     """
     points = chart.points
-    normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
+    normals = smooth_normals(chart.radius, chart.grid, _ROW_SMOOTHING)
+    faces = np.stack([facing(photo, points, normals) for photo in photos])
+    best = faces == faces.max(axis=0)
     clear = np.zeros(chart.grid.shape, bool)
-    for photo, front in zip(photos, nearest, strict=True):
-        free = photo.sample(photo.covered, photo.project(points)[0]) < 0.5
-        faces = facing(photo, points, normals) > options.least_showing
-        clear |= free & faces & sees(photo, front, points, 2 * HIDDEN)
+    for photo, front, cosine, first in zip(photos, nearest, faces, best, strict=True):
+        free = photo.valid & (photo.covered == 0) & (photo.void == 0)
+        shown = photo.sample(free.astype(np.float32), photo.project(points)[0]) > 0.5
+        least = np.where(first, options.least_showing, options.least_beside)
+        clear |= shown & (cosine > least) & sees(photo, front, points, 2 * HIDDEN)
     used = chart.used(PAST_EDGE, options.gum_height)
     return clear & ~_scraps(clear & used, chart.grid.density)
 
