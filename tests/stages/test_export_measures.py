@@ -11,6 +11,7 @@ import pytest
 
 from data_samples.mouths import Mouth, random_mouth
 from pipeline.artifacts.teeth import filled
+from stages.export.measuring import measures
 from stages.export.measuring.landmarks import read_landmarks
 from stages.export.measuring.measures import measure_mouth, mouth_axes
 from tests.stages.measured_mouth import YAWS, photographed, truth
@@ -138,6 +139,14 @@ def test_sides_are_the_patients() -> None:
     assert to_left["direction"] == "lower midline to the patient's left"
     assert to_right["direction"] == "lower midline to the patient's right"
     assert to_left["value"] - to_right["value"] == pytest.approx(5.0, abs=1.0)
+
+
+def test_a_shift_of_nothing_has_no_direction(monkeypatch: pytest.MonkeyPatch) -> None:
+    midline = next(rule for rule in measures.RULES if rule.name == "midline_shift")
+    for shift, said in ((0.02, ""), (0.08, midline.signs[0]), (-0.08, midline.signs[1])):
+        rule = replace(midline, measure=lambda places, axes, mm=shift: (mm, np.zeros((2, 3))))
+        monkeypatch.setattr(measures, "RULES", (rule,))
+        assert measured(grown(3, midline=2.5))["midline_shift"]["direction"] == said
 
 
 def test_a_tooth_that_is_not_there_is_named() -> None:

@@ -37,6 +37,8 @@ DRAWS = 100
 _WIDE = 1.96
 #: Sure and fair: the uncertainty is under this share of the distance between neighbouring crowns.
 _SURE, _FAIR = 0.08, 0.25
+#: So much (of the same distance) is nothing, and has no direction: .05 mm.
+_NOTHING = 0.006
 #: Above this doubt of a number the value is of no use.
 MOST_DOUBT = 0.5
 #: A row of crowns this much flatter than long has no plane of its own.
@@ -139,11 +141,12 @@ def _measured(
     values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
     share = rule.stands_for * (rule.covered if covered else 1.0)
     percent = scale.get("uncertainty_percent") or 0.0
-    off = [float(np.std(values)), share * spacing_of(places), value * percent / 100]
+    spacing = spacing_of(places)
+    off = [float(np.std(values)), share * spacing, value * percent / 100]
     return {
         "value": _rounded(value),
         "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),
-        "direction": rule.signs[0 if value >= 0 else 1],
+        "direction": rule.signs[0 if value >= 0 else 1] if abs(value) > _NOTHING * spacing else "",
         "points": [[_rounded(x) for x in point] for point in points],
     }
 
