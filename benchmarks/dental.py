@@ -26,6 +26,7 @@ from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.rigid import angle_between, nearest_rotation
 from pipeline.geometry.similarity import similarity
+from stages.dentition.overlay import sheet
 from stages.dentition.working import resized_dentition, working_view
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
@@ -343,9 +344,10 @@ def main() -> None:
         print(f"| {' | '.join(cells)} |", flush=True)
         if options.pictures:
             options.pictures.mkdir(parents=True, exist_ok=True)
-            for name in ("teeth", "turned"):
+            shown = {"teeth": sheet(list(teeth.labelled.values())), "turned": teeth.turned}
+            for name, picture in shown.items():
                 path = options.pictures / f"{names.replace(',', '_')}_{name}.png"
-                cv2.imwrite(str(path), teeth.pictures[name][..., ::-1])
+                cv2.imwrite(str(path), picture[..., ::-1])
 
 
 if __name__ == "__main__":

@@ -70,8 +70,8 @@ def sheet_rows(row: Row, outcome: Outcome) -> dict[str, Picture]:
     overlay = overlay_row(outcome, row["sort"])
     if overlay is not None:
         rows[name] = captioned(overlay, text)
-    if row["accepted"] and "turned" in outcome.pictures and name != "mixes":
-        rows["turned"] = captioned(outcome.pictures["turned"], text)
+    if row["accepted"] and "surface_turned" in outcome.pictures and name != "mixes":
+        rows["turned"] = captioned(outcome.pictures["surface_turned"], text)
     return rows
 
 

@@ -24,14 +24,11 @@ MOST_ROWS = 12
 
 def overlay_row(outcome: Outcome, sort: str) -> Picture | None:
     """The labelled pictures of an item side by side; of a series, those of the reader."""
-    read = outcome.read.pictures if outcome.read else {}
-    if sort != SERIES and "teeth" in outcome.pictures:
-        shown = outcome.pictures["teeth"]
-    elif read:
-        shown = sheet([read[name] for name in sorted(read)])
-    else:
-        return None
-    return shown
+    if sort != SERIES and "teeth" in outcome.pictures:  # of a failure
+        return outcome.pictures["teeth"]
+    teeth = outcome.read if sort == SERIES else outcome.teeth
+    labelled = teeth.pictures if teeth else {}
+    return sheet([labelled[name] for name in sorted(labelled)]) if labelled else None
 
 
 def captioned(picture: Picture, text: str, width: int = WIDTH) -> Picture:

@@ -55,8 +55,8 @@ def measurements(case: Case) -> Iterator[Section]:
         rows = [_measured(entry) for entry in entries]
         notes = [
             "By itself, from the teeth's numbers and outlines: check those first. The uncertainty "
-            "holds in 19 of 20 cases, that of the scale in it. How each is measured says the "
-            "viewer, which also draws it.",
+            "holds in 19 of 20 cases, that of the scale in it. The viewer says how each is "
+            "measured, and draws it.",
             str(scale.get("text", "")),
         ]
         blocks = [Table(("", "value", "how sure"), rows, stacked=True)]

@@ -50,7 +50,7 @@ def matches(case: Case) -> Iterator[Section]:
             title = title_of(path.stem, labels)
             others.append(from_file(path, title, title, 900))
     if others:
-        said = "Labels and shapes that were found. A wrong one makes the scene wrong."
+        said = "What was found, drawn to be checked. Where it is wrong, so is the scene."
         yield Section("", [Text(said), Grid(others[:MOST_OTHERS], "wide")], place="check")
     drawn.sort(key=lambda item: (item[0], item[1]))
     tiles = [

@@ -100,7 +100,7 @@ def found_teeth(yaws=(-40, 0, 40), widths=()):
     ]
     return Reconstruction(
         list(photographs(len(yaws)).views), numbered, fit, surface,
-        pictures={"teeth": picture, "turned": picture},
+        turned=picture, labelled={view.name: picture for view in numbered},
     )  # fmt: skip
 
 

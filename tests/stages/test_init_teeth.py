@@ -80,7 +80,8 @@ def test_outputs_agree_with_each_other_and_lead_back_to_millimetres(tmp_path, mo
             seen = points[confidence > 1] @ world[:3, :3].T + world[:3, 3]
             mm = seen @ to_mm[:3, :3].T + to_mm[:3, 3]
             np.testing.assert_allclose(np.linalg.norm(mm, axis=1), 20, atol=2e-3)
-    assert sorted(context.result("pictures").images) == ["teeth", "turned"]
+    assert sorted(context.result("pictures").images) == ["surface_turned"]
+    assert sorted(context.result("teeth").pictures) == ["000", "001", "002"]
     assert any("textbook teeth" in warning for warning in context.warnings)
 
 

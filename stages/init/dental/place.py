@@ -73,7 +73,9 @@ def from_teeth(context: StageContext, views: Views) -> None:
         *of_several_days(views, names),
     ):  # fmt: skip
         context.warn(doubt)
-    numbered = updated(read, [d for d in teeth.dentitions if d is not None])
+    numbered = replace(
+        updated(read, [d for d in teeth.dentitions if d is not None]), pictures=teeth.labelled
+    )
     _write(context, given, teeth, numbered)
 
 
@@ -218,7 +220,7 @@ def _write(
         context, views, placement.views,
         replace(placement.placed(), mouth_from_world=mouth), depths, points, pairs, numbered,
     )  # fmt: skip
-    context.save(Pictures(teeth.pictures))
+    context.save(Pictures({"surface_turned": teeth.turned}))
     context.summarize(
         method="dental", **tooth_counts(teeth),
         scale_uncertainty_percent=round(100 * uncertainty, 1),

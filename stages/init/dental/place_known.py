@@ -37,6 +37,7 @@ from stages.init.dental.reconstruct import (
     PlacedTeeth,
     Progress,
     Reconstruction,
+    evidence,
     place_teeth,
     with_surface,
 )
@@ -157,7 +158,8 @@ class HeldTeeth:
         placed = zip(self.names, teeth.fit.views, strict=True)
         if without := [name for name, view in placed if view is None]:
             raise ReconstructionError(
-                f"No two rows of teeth could be made out in {', '.join(without)}.", teeth.pictures
+                f"No two rows of teeth could be made out in {', '.join(without)}.",
+                evidence(teeth.labelled),
             )
         return teeth
 
@@ -250,7 +252,7 @@ def _write(
         context, views, shown, placement.placed(), depths,
         cloud.thinned(cloud.joined(clouds), config.max_points, context.seed), pairs,
     )  # fmt: skip
-    context.save(Pictures(teeth.pictures))
+    context.save(Pictures({"surface_turned": teeth.turned}))
     context.summarize(dense="teeth", dense_points=len(points), **tooth_counts(teeth))
 
 

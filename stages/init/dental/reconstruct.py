@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -47,16 +47,18 @@ class Reconstruction:
         dentitions: the teeth in each with their numbers; None where none are used.
         fit: cameras and named landmarks, in pixels of `views`.
         surface: dense depth of each placed view, and one cloud.
+        turned: the surface from three sides, in colour and as it is shaped.
+        labelled: view name -> the photograph with the outlines and numbers of its teeth.
         mirrored: which photographs were turned back.
-        pictures: for people to check: the labelled photographs, the cloud turned.
     """
 
     views: list[View]
     dentitions: list[Dentition | None]
     fit: ArchFit
     surface: ArchSurface
+    turned: Picture
+    labelled: Mapping[str, Picture]
     mirrored: tuple[int, ...] = ()
-    pictures: Mapping[str, Picture] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,9 @@ class PlacedTeeth:
     full: list[FullSize | None]
 
     @property
-    def pictures(self) -> dict[str, Picture]:
-        """The photographs with the numbers of their teeth, drawn when asked for."""
-        return labelled(self.views, self.dentitions)
+    def labelled(self) -> dict[str, Picture]:
+        """View name -> the photograph with the numbers of its teeth, drawn when asked for."""
+        return overlays(self.views, self.dentitions)
 
 
 def reconstruct_teeth(
@@ -127,7 +129,7 @@ def place_teeth(
         raise ReconstructionError(
             f"Rows of closed teeth, seen from the front or a side, were made out in {found} of "
             f"{len(views)} photographs; three are needed. {HOW_TO_SHOOT_TEETH}",
-            labelled(views, dentitions) if found else {},
+            evidence(overlays(views, dentitions)),
             {"teeth": Teeth(tuple(d for d in dentitions if d is not None))} if found else {},
         )
 
@@ -162,7 +164,7 @@ def place_teeth(
             "Check the numbers in the labelled photographs; a wrong one can be put right on the "
             f"page check.html. {HOW_TO_SHOOT_TEETH} If you know better, go on all the same: "
             "--set init.dental.accept_doubtful=true.",
-            labelled(views, numbered),
+            evidence(overlays(views, numbered)),
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
     full = [
@@ -201,9 +203,9 @@ def with_surface(
         [view.image for view in small.views], [view.valid() for view in small.views],
         small.dentitions, small.fit, surface, threads, progress, teeth.full,
     )  # fmt: skip
-    pictures = {**teeth.pictures, "turned": turned_sheet(dense)}
     return Reconstruction(
-        teeth.views, teeth.dentitions, teeth.fit, dense, small.mirrored, pictures
+        teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), teeth.labelled,
+        small.mirrored,
     )  # fmt: skip
 
 
@@ -227,11 +229,18 @@ def with_numbers(dentition: Dentition, placed: PlacedView | None, fit: ArchFit) 
     return replace(dentition, upper=rows["upper"], lower=rows["lower"])
 
 
-def labelled(views: list[View], dentitions: list[Dentition | None]) -> dict[str, Picture]:
-    """Name -> picture: each photograph with the numbers of its teeth, and all beside each other."""
-    pictures = {
-        f"teeth_{view.name}": labelled_overlay(view.image, dentition)
+def overlays(views: list[View], dentitions: list[Dentition | None]) -> dict[str, Picture]:
+    """View name -> the photograph with the outlines and numbers of its teeth, if it has some."""
+    return {
+        view.name: labelled_overlay(view.image, dentition)
         for view, dentition in zip(views, dentitions, strict=True)
         if dentition is not None
     }
-    return {"teeth": sheet(list(pictures.values())), **pictures}
+
+
+def evidence(pictures: Mapping[str, Picture]) -> dict[str, Picture]:
+    """What is kept of labelled photographs when a run fails: each, and all beside each other."""
+    if not pictures:
+        return {}
+    named = {f"teeth_{name}": picture for name, picture in pictures.items()}
+    return {"teeth": sheet(list(pictures.values())), **named}
