@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
+from stages.teeth import reader
 from stages.teeth.config import TeethConfig
 from stages.teeth.read import Reading
+from stages.teeth.reader import PhotographReader
 from stages.teeth.stage import TeethStage
 
 COUNT = 30
@@ -68,3 +71,18 @@ def test_the_reader_can_be_told_to_read_all_of_it_or_nothing(
     assert len(asked) == COUNT
     run(tmp_path / "none", method="none")
     assert len(asked) == COUNT
+
+
+@pytest.mark.parametrize(
+    ("sure", "unsure", "shows"), [(8, 0, True), (8, 4, True), (8, 8, False), (5, 0, False)]
+)
+def test_what_repeats_is_not_yet_teeth(
+    sure: int, unsure: int, shows: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few windows of a castle look surely like crowns, most of them hardly."""
+    crowns = [SimpleNamespace(score=score) for score in [0.95] * sure + [0.7] * unsure]
+    answer = SimpleNamespace(tooth=np.ones((24, 32), np.float32))
+    glances = SimpleNamespace(turned=lambda quarters: (answer, crowns))
+    monkeypatch.setattr(reader, "Glances", lambda image, valid: glances)
+    view = View("000", np.full((24, 32, 3), 0.5, np.float32))
+    assert PhotographReader([view], 1).shows_teeth() is shows
