@@ -33,7 +33,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 14
+    version = 15
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -63,6 +63,7 @@ class ExportStage(Stage):
         from stages.export.beside import Beside
         from stages.export.mesh.building import build_mesh
         from stages.export.mesh.jaws import crown_maps, jaws_of
+        from stages.export.mesh.rims import even_rims
         from stages.export.mesh.texture.sight import sights
         from stages.export.scene import assemble
         from stages.export.splatfiles.writing import write_splats
@@ -116,6 +117,9 @@ class ExportStage(Stage):
                 seen = sights(mesh, scene.cameras, scene.masks)
                 if mouth is not None:
                     jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
+                if jaws:
+                    mesh = even_rims(mesh, jaws["upper"])
+                    seen = sights(mesh, scene.cameras, scene.masks)
             if config.viewer:
                 known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)
                 page = beside.give(_write_page, context, scene, folder, known)

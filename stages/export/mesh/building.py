@@ -14,6 +14,7 @@ from pipeline.artifacts.views import to_uint8
 from stages.export.mesh.bend import bent
 from stages.export.mesh.field import TRUNCATION, colors_of, fuse
 from stages.export.mesh.nets import zero_surface
+from stages.export.mesh.rims import even_rims
 from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,
@@ -52,7 +53,7 @@ def build_mesh(
     most_faces: int,
     progress: Progress,
 ) -> Mesh | None:
-    """Reconstruct the surface, clean and simplify it.
+    """Reconstruct the surface, clean and simplify it, with even rims.
 
     Args:
         scene: what to mesh.
@@ -88,7 +89,7 @@ def build_mesh(
     if len(surface) < FEWEST_FACES:
         return None
     surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE), SMALLEST_PART)
-    return surface if len(surface) >= FEWEST_FACES else None
+    return even_rims(surface) if len(surface) >= FEWEST_FACES else None
 
 
 def fused(
