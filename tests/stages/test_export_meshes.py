@@ -20,7 +20,15 @@ from stages.dentition.crowns import Outline, dentition_of
 from stages.export.mesh.bend import bent
 from stages.export.mesh.jaws import LOWER, NEITHER, UPPER, jaws_at, jaws_of
 from stages.export.mesh.nets import zero_surface
-from stages.export.mesh.solid import _field, border_vertices, closed, is_closed, well_composed
+from stages.export.mesh.solid import (
+    _field,
+    _Grid,
+    _Seen,
+    border_vertices,
+    closed,
+    is_closed,
+    well_composed,
+)
 from stages.export.mesh.surface import Mesh
 from stages.export.mesh.texture.atlas import packed, textured
 from stages.export.mesh.texture.glb import write_glb
@@ -185,6 +193,22 @@ def test_a_closed_model_is_watertight_and_keeps_what_was_seen() -> None:
     open_model = replace(model, faces=model.faces[1:])
     assert not is_closed(open_model)
     assert not is_closed(replace(model, faces=model.faces[:, ::-1])), "inside out"
+
+
+def test_of_a_grid_what_is_near_a_surface_is_found_as_one_by_one() -> None:
+    mesh = arch()
+    low, high = mesh.vertices.min(0) - 3, mesh.vertices.max(0) + 3
+    shape = tuple(int(size) for size in -(-(high - low) / 0.4 // 8).astype(int) * 8)
+    grid, seen, reach = _Grid(low, shape, 0.4), _Seen(mesh), 1.3
+    border, distance, cosine = (found.ravel() for found in seen.around(grid, reach))
+    points = grid.points(np.indices(shape).reshape(3, -1).T)
+    _, each_border, each_distance, each_cosine = seen.nearest(points)
+    near = each_distance < reach
+    assert 0.02 < near.mean() < np.isfinite(distance).mean() < 0.6
+    np.testing.assert_array_equal(distance[near], each_distance[near])
+    np.testing.assert_array_equal(cosine[near], each_cosine[near])
+    np.testing.assert_array_equal(border[near], each_border[near])
+    assert (distance[~near] >= reach).all()
 
 
 def test_whatever_is_solid_gets_a_surface_without_loose_ends() -> None:

@@ -33,6 +33,8 @@ EVENINGS = 20
 FREE = 0.5
 #: Made-up parts thinner than twice this many voxels are left out.
 THIN = 2
+#: The nearest surface is sought for cells of so many points a side first; divides `BLOCK`.
+COARSE = 4
 #: Points so near to the surface, in voxels, have their true distance.
 EXACT = 2.0
 #: A vertex goes back onto the seen surface if it is no further from it, in voxels.
@@ -51,10 +53,9 @@ class _Grid:
     shape: tuple[int, int, int]
     voxel: float
 
-    def points(self) -> Floats:
-        """[X, Y, Z, 3]"""
-        axes = [self.low[k] + self.voxel * np.arange(self.shape[k]) for k in range(3)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
+    def points(self, places: npt.NDArray) -> Floats:
+        """[N, 3] of places [N, 3], which may lie between the grid's."""
+        return (self.low + self.voxel * places).astype(np.float32)
 
 
 class _Seen:
@@ -97,6 +98,27 @@ class _Seen:
         )
         return there, border, distance, cosine
 
+    def around(self, grid: _Grid, reach: float) -> tuple[Bools, Array, Array]:
+        """Of a grid's points whether the nearest is on the border, distance and cosine, [X, Y, Z].
+
+        Points further away than `reach`, which are most, are not looked at: they have a distance
+        of infinity.
+        """
+        cells = [size // COARSE for size in grid.shape]
+        middles = COARSE * np.indices(cells).reshape(3, -1).T + (COARSE - 1) / 2
+        # No point of a cell is further from its middle than this.
+        within = grid.voxel * (COARSE - 1) / 2 * np.sqrt(3)
+        away = self.scene.compute_distance(self.tensor(grid.points(middles))).numpy()
+        close = (away < reach + 1.01 * within).reshape(cells)
+        for axis in range(3):
+            close = np.repeat(close, COARSE, axis=axis)
+        border = np.zeros(grid.shape, bool)
+        distance, cosine = np.full(grid.shape, np.inf), np.zeros(grid.shape)
+        _, border[close], distance[close], cosine[close] = self.nearest(
+            grid.points(np.argwhere(close))
+        )
+        return border, distance, cosine
+
 
 def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None:
     """A closed model with a flat base.
@@ -125,11 +147,7 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
     shape = -(-shape // BLOCK) * BLOCK
     grid = _Grid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel)
     seen = _Seen(mesh)
-    points = grid.points()
-    _, on_border, away, leaning = seen.nearest(points.reshape(-1, 3))
-    border: Bools = on_border.reshape(grid.shape)
-    distance: Array = away.reshape(grid.shape)
-    cosine: Array = leaning.reshape(grid.shape)
+    border, distance, cosine = seen.around(grid, max(depth, EXACT * voxel))
     free = (cosine > 0) & ~border & (distance < FREE * depth)
     free[:, int((high[1] - low[1]) / voxel) + 1 :] = False  # the base is whole
     shell = (distance < depth) & np.where(border, cosine < -BEHIND, cosine <= 0)
@@ -145,7 +163,8 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
         return None
     rounded = SLOPE * ndimage.gaussian_filter(0.5 - solid.astype(np.float32), BLUR)
     exact = ~border & (distance < EXACT * voxel)
-    values = np.where(exact, np.sign(cosine) * distance / voxel, rounded).astype(np.float32)
+    values = rounded
+    values[exact] = np.sign(cosine[exact]) * distance[exact] / voxel
     values = np.where(solid, np.minimum(values, -LEAST), np.maximum(values, LEAST))
     plane = (np.arange(grid.shape[1]) - (layer - 0.5)).astype(np.float32)
     values = np.maximum(values, plane[None, :, None])
