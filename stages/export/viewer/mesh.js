@@ -1,5 +1,23 @@
 // Draws the triangle mesh into a picture of its own, which the screen shader lays over the scene.
 
+/**
+ * @param {Float32Array} vertices three numbers each @param {Uint16Array} faces three corners each
+ * @returns {Float32Array} the vertices' normals, those of their triangles by area; of any length
+ */
+function vertexNormals(vertices, faces) {
+  const normals = new Float32Array(vertices.length);
+  const point = (corner) => vertices.subarray(3 * corner, 3 * corner + 3);
+  for (let k = 0; k < faces.length; k += 3) {
+    const corners = faces.subarray(k, k + 3);
+    const [a, b, c] = [...corners].map(point);
+    const normal = cross(minus(b, a), minus(c, a));
+    for (const corner of corners) {
+      for (let axis = 0; axis < 3; axis++) normals[3 * corner + axis] += normal[axis];
+    }
+  }
+  return normals;
+}
+
 class MeshLayer {
   /** @param {WebGL2RenderingContext} gl @param {object} program @param {object} mesh see `Splats` */
   constructor(gl, program, mesh) {
@@ -10,6 +28,7 @@ class MeshLayer {
     this.vertices = gl.createVertexArray();
     gl.bindVertexArray(this.vertices);
     this.#attribute("a_position", mesh.vertices, 3, gl.FLOAT);
+    this.#attribute("a_normal", vertexNormals(mesh.vertices, mesh.faces), 3, gl.FLOAT);
     this.#attribute("a_jaw", mesh.jaws, 1, gl.UNSIGNED_BYTE);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.faces, gl.STATIC_DRAW);

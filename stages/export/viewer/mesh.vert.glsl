@@ -10,8 +10,10 @@ uniform vec2 u_size;
 uniform float u_near;
 
 in vec3 a_position;
+in vec3 a_normal;
 in float a_jaw;
 out vec3 v_world;
+out vec3 v_normal;
 flat out float v_jaw;        // between jaws it means nothing
 
 void main() {
@@ -21,5 +23,6 @@ void main() {
   vec2 pixel = u_focal * p.xy + u_principal * p.z;  // times z
   gl_Position = vec4(2.0 * pixel.x / u_size.x - p.z, p.z - 2.0 * pixel.y / u_size.y, depth, p.z);
   v_world = a_position;
+  v_normal = a_normal;
   v_jaw = a_jaw;
 }
