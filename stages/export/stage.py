@@ -234,6 +234,7 @@ def _knowledge(
 ) -> Knowledge:  # fmt: skip
     """What the viewer shows beside the scene."""
     from stages.export.mesh.jaws import jaws_at
+    from stages.export.mesh.rims import even_rims
     from stages.export.texts import describe_frame
     from stages.export.viewer.knowledge import (
         coarse,
@@ -246,8 +247,8 @@ def _knowledge(
     surfaces = seen_surfaces(scene.cameras, scene.seen, scene.masks)
     overlay, side = None, None
     if mesh is not None:
-        vertices, faces = coarse(mesh.vertices, mesh.faces)
-        overlay = vertices, faces, jaws_at(vertices, mesh, jaws)
+        small = even_rims(coarse(mesh))
+        overlay = small.vertices, small.faces, jaws_at(small.vertices, mesh, jaws)
         side = jaws_at(scene.gaussians.means, mesh, jaws)
     return Knowledge(
         scale=scale.as_dict(),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.export.mesh.surface import Mesh
 from stages.export.viewer.compact import Pack, morton_order, octahedral
 from stages.export.viewer.knowledge import (
     coarse,
@@ -79,7 +80,9 @@ def test_a_coarse_mesh_keeps_its_shape() -> None:
             np.column_stack([corner + 1, corner + 81, corner + 80]),
         ]
     )
-    small, triangles = coarse(vertices, faces, 600)
+    mesh = coarse(Mesh(vertices, faces.astype(np.int32), np.column_stack([grid, grid[:, 0]])), 600)
+    small, triangles = mesh.vertices, mesh.faces
+    np.testing.assert_allclose(mesh.colors[:, :2], small[:, :2])
     assert 200 < len(small) < 1000
     assert triangles.max() < len(small)
     assert np.abs(small[:, 2] - 0.1 * np.sin(6 * small[:, 0])).max() < 0.01

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from stages.export.mesh.surface import Mesh
 from stages.splatting.rendering import RenderedView
 from stages.splatting.support import SeenSurface, seen_surface, supporting_views
 
@@ -45,15 +46,14 @@ def photographs_that_saw(points: Floats, surfaces: Sequence[SeenSurface]) -> Byt
     return np.minimum(counts, 255).astype(np.uint8)
 
 
-def coarse(
-    vertices: Floats, faces: npt.NDArray[np.integer], count: int = OVERLAY_VERTICES
-) -> tuple[Array, npt.NDArray[np.int64]]:
+def coarse(mesh: Mesh, count: int = OVERLAY_VERTICES) -> Mesh:
     """A mesh with about `count` vertices: those in a cell of a grid become one, their mean.
 
     (Vertex clustering, Rossignac & Borrel 1993: not the best triangles, but at once.)
     """
+    vertices, faces = mesh.vertices, mesh.faces
     if len(vertices) <= count:
-        return np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+        return mesh
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     # A surface crosses about 1.5 cells for each square of a cell's edge.
@@ -62,13 +62,16 @@ def coarse(
     size = keys.max(0) + 1
     flat = (keys[:, 0] * size[1] + keys[:, 1]) * size[2] + keys[:, 2]
     _, member, number = np.unique(flat, return_inverse=True, return_counts=True)
-    sums = [np.bincount(member, vertices[:, axis], len(number)) for axis in range(3)]
-    merged = np.stack(sums, 1) / number[:, None]
+    merged, colors = (
+        np.stack([np.bincount(member, values[:, k], len(number)) for k in range(3)], 1)
+        / number[:, None]
+        for values in (vertices, mesh.colors)
+    )
     corners = member[faces]
     whole = (corners != np.roll(corners, 1, axis=1)).all(1)
     corners = corners[whole]
     _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
-    return merged, corners[np.sort(first)].astype(np.int64)
+    return Mesh(merged, corners[np.sort(first)].astype(np.int32), colors)
 
 
 def directions(

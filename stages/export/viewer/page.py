@@ -63,7 +63,7 @@ class Knowledge:
     axes: npt.NDArray[np.float64] | None = None
     jaws: npt.NDArray[np.uint8] | None = None
     seen: npt.NDArray[np.uint8] | None = None
-    mesh: tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.uint8]] | None = None
+    mesh: tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.uint8]] | None = None
 
 
 def encode_jpeg(image: npt.NDArray[np.uint8], quality: int) -> str:
