@@ -98,10 +98,7 @@ def found_teeth(yaws=(-40, 0, 40), widths=()):
         with_numbers(dentition, view, fit)
         for dentition, view in zip(read_teeth(len(yaws)).views, views, strict=True)
     ]
-    return Reconstruction(
-        list(photographs(len(yaws)).views), numbered, fit, surface,
-        turned=picture, labelled={view.name: picture for view in numbered},
-    )  # fmt: skip
+    return Reconstruction(list(photographs(len(yaws)).views), numbered, fit, surface, picture)
 
 
 def photographs(count=3):

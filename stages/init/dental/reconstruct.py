@@ -48,7 +48,6 @@ class Reconstruction:
         fit: cameras and named landmarks, in pixels of `views`.
         surface: dense depth of each placed view, and one cloud.
         turned: the surface from three sides, in colour and as it is shaped.
-        labelled: view name -> the photograph with the outlines and numbers of its teeth.
         mirrored: which photographs were turned back.
     """
 
@@ -57,8 +56,12 @@ class Reconstruction:
     fit: ArchFit
     surface: ArchSurface
     turned: Picture
-    labelled: Mapping[str, Picture]
     mirrored: tuple[int, ...] = ()
+
+    @property
+    def labelled(self) -> dict[str, Picture]:
+        """View name -> the photograph with the numbers of its teeth, drawn when asked for."""
+        return overlays(self.views, self.dentitions)
 
 
 @dataclass(frozen=True)
@@ -204,8 +207,7 @@ def with_surface(
         small.dentitions, small.fit, surface, threads, progress, teeth.full,
     )  # fmt: skip
     return Reconstruction(
-        teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), teeth.labelled,
-        small.mirrored,
+        teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), small.mirrored
     )  # fmt: skip
 
 
