@@ -33,7 +33,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 16
+    version = 17
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -63,7 +63,7 @@ class ExportStage(Stage):
         from stages.export.beside import Beside
         from stages.export.mesh.building import build_mesh
         from stages.export.mesh.jaws import crown_maps, jaws_of
-        from stages.export.mesh.rims import even_rims
+        from stages.export.mesh.rims import even_border
         from stages.export.mesh.texture.sight import sights
         from stages.export.scene import assemble
         from stages.export.splatfiles.writing import write_splats
@@ -118,7 +118,7 @@ class ExportStage(Stage):
                 if mouth is not None:
                     jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
                 if jaws:
-                    mesh = even_rims(mesh, jaws["upper"])
+                    mesh = even_border(mesh, jaws["upper"])
                     seen = sights(mesh, scene.cameras, scene.masks)
             if config.viewer:
                 known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)

@@ -21,19 +21,43 @@ ROUNDS = 8
 _MOST_HOLDS = 10
 
 
-def even_rims(mesh: Mesh, side: Bools | None = None) -> Mesh:
+def even_rims(mesh: Mesh) -> Mesh:
     """The mesh with its rims evened along themselves; the surface between stays.
 
     Nothing moves where rims meet, and no triangle is turned over.
-
-    Args:
-        mesh: the mesh.
-        side: [F] the faces whose border with the others is a rim as well.
     """
-    rim = _rim_edges(mesh.faces, np.zeros(len(mesh), bool) if side is None else side)
+    return _evened(mesh, rim_edges(mesh.faces))
+
+
+def even_border(mesh: Mesh, side: Bools) -> Mesh:
+    """The same for the border between some faces [F] and the others; the rims stay."""
+    edges, sharing, on_side = _edges(mesh.faces, side)
+    return _evened(mesh, edges[(sharing == 2) & (on_side == 1)])
+
+
+def rim_edges(faces: npt.NDArray[np.int32]) -> Ints:
+    """[E, 2] vertices of the edges that only one of the faces [F, 3] has."""
+    edges, sharing, _ = _edges(faces, np.zeros(len(faces), bool))
+    return edges[sharing == 1]
+
+
+def _edges(faces: npt.NDArray[np.int32], side: Bools) -> tuple[Ints, Ints, Ints]:
+    """Each edge of faces [F, 3]: its vertices [E, 2], how many faces have it, and how many of them
+    are on the side [F]."""
+    start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
+    count = int(faces.max(initial=0)) + 1
+    keys, place = np.unique(
+        np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True
+    )
+    on_side = np.bincount(place[np.repeat(side, 3)], minlength=len(keys))
+    return np.stack([keys // count, keys % count], axis=1), np.bincount(place), on_side
+
+
+def _evened(mesh: Mesh, curve: Ints) -> Mesh:
+    """The mesh with the vertices along edges [E, 2] moved; those with other than two stay."""
     count = len(mesh.vertices)
-    moves = np.bincount(rim.ravel(), minlength=count) == 2
-    ends = np.concatenate([rim, rim[:, ::-1]])
+    moves = np.bincount(curve.ravel(), minlength=count) == 2
+    ends = np.concatenate([curve, curve[:, ::-1]])
     neighbours = coo_matrix((np.full(len(ends), 0.5), ends.T), shape=(count, count)).tocsr()
     before = face_normals(mesh)
     for _ in range(_MOST_HOLDS):
@@ -48,15 +72,3 @@ def even_rims(mesh: Mesh, side: Bools | None = None) -> Mesh:
             return even
         moves[held] = False
     return mesh
-
-
-def _rim_edges(faces: npt.NDArray[np.int32], side: Bools) -> Ints:
-    """[E, 2] vertices of the edges of one face [F, 3], or of two on different sides [F]."""
-    start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
-    count = int(faces.max(initial=0)) + 1
-    edges, place = np.unique(
-        np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True
-    )
-    sharing, on_side = np.bincount(place), np.bincount(place, np.repeat(side, 3))
-    rim = edges[(sharing == 1) | ((sharing == 2) & (on_side == 1))]
-    return np.stack([rim // count, rim % count], axis=1)

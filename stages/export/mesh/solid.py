@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from stages.export.mesh.field import BLOCK, Field, around_blocks
 from stages.export.mesh.nets import zero_surface
+from stages.export.mesh.rims import rim_edges
 from stages.export.mesh.surface import Mesh, vertex_normals
 
 Array = npt.NDArray[np.float64]
@@ -178,13 +179,8 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
 
 def border_vertices(mesh: Mesh) -> Bools:
     """[V] whether a vertex is on an edge that only one face has."""
-    start, end = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
-    key = np.minimum(start, end).astype(np.int64) * len(mesh.vertices) + np.maximum(start, end)
-    edges, times = np.unique(key, return_counts=True)
-    once = edges[times == 1]
     found = np.zeros(len(mesh.vertices), bool)
-    found[once // len(mesh.vertices)] = True
-    found[once % len(mesh.vertices)] = True
+    found[rim_edges(mesh.faces)] = True
     return found
 
 
