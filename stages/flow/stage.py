@@ -15,8 +15,11 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageConfig, StageContext
 
-#: Trusted shares below this are worth a word to the user.
+#: Trusted shares below this are worth a word to the user,
 _POOR_SHARE = 0.1
+#: where the views are this near to each other (degrees) or nobody knows how near: of wider ones
+#: nothing better is expected. It is what a user is asked to photograph at.
+_NEAR = 20.0
 
 
 class FlowConfig(StageConfig):
@@ -90,7 +93,7 @@ class FlowStage(Stage):
     """Views (and cameras and points, where there are any) -> flow of neighbouring views."""
 
     name = "flow"
-    version = 1
+    version = 2
     summary = "optical flow between neighbouring views, both ways, with consistency masks"
     Config = FlowConfig
     requires = ("views",)
@@ -143,7 +146,7 @@ def _run(context: StageContext) -> None:
             depth = splat_depth(points.positions, points.scale, camera)
         return Side(view.image, view.valid(), camera, depth)
 
-    shown = {view.name: view for pair in pairs for view in pair}
+    shown = {view.name: view for pair in pairs for view in pair[:2]}
     sides = dict(zip(shown, in_threads(side, shown.values(), context.threads), strict=True))
 
     estimator = Estimator(
@@ -167,9 +170,9 @@ def _run(context: StageContext) -> None:
         lambda pair: flow_between(sides[pair[0].name], sides[pair[1].name], estimator, trust),
         pairs, context.threads, lambda done: context.progress("flow", done, len(pairs)),
     )  # fmt: skip
-    for (view_i, view_j), (forward, backward) in zip(pairs, found, strict=True):
+    for (view_i, view_j, angle), (forward, backward) in zip(pairs, found, strict=True):
         share = 0.5 * float(forward.mask.mean() + backward.mask.mean())
-        if share < _POOR_SHARE:
+        if share < _POOR_SHARE and not angle > _NEAR:
             context.warn(
                 f"The flow between views {view_i.name} and {view_j.name} can be trusted on only "
                 f"{share:.0%} of the pixels; this pair hardly contributes to the fit."
@@ -209,10 +212,11 @@ def _cameras_of(views: Views, placed: Cameras | None) -> dict[str, Camera]:
 
 def _choose_pairs(
     views: Views, cameras: dict[str, Camera] | None, points: Points | None, config: FlowConfig
-) -> tuple[list[tuple[View, View]], list[tuple[str, str, float]]]:
+) -> tuple[list[tuple[View, View, float]], list[tuple[str, str, float]]]:
     """Pair the neighbours in viewing order; also return who is too far apart, and how far.
 
-    Without cameras (None) the viewing order is that of the views, and no angle is known.
+    Angles are degrees. Without cameras (None) the viewing order is that of the views, and no angle
+    is known (NaN).
     """
     from pipeline.geometry.order import viewing_order
     from stages.flow.order import neighbour_pairs, parallax_angle
@@ -220,7 +224,8 @@ def _choose_pairs(
     if cameras is None:
         order = list(range(len(views)))
         return [
-            (views.views[a], views.views[b]) for a, b in neighbour_pairs(order, config.window)
+            (views.views[a], views.views[b], np.nan)
+            for a, b in neighbour_pairs(order, config.window)
         ], []
     placed = [view for view in views.views if view.name in cameras]
     centres = np.array([cameras[view.name].centre for view in placed]).reshape(-1, 3)
@@ -230,7 +235,7 @@ def _choose_pairs(
         view_i, view_j = placed[a], placed[b]
         angle = parallax_angle(cameras[view_i.name], cameras[view_j.name], positions)
         if angle <= config.max_angle:
-            pairs.append((view_i, view_j))
+            pairs.append((view_i, view_j, angle))
         else:
             too_wide.append((view_i.name, view_j.name, angle))
     return pairs, too_wide
@@ -243,22 +248,20 @@ def _warn_of_missing(
     pairs: int,
     too_wide: list[tuple[str, str, float]],
 ) -> None:
-    limit = f"flow.max_angle={context.config.max_angle:g}°"
-    wide = ", ".join(
-        f"{i} and {j} ({angle:.0f}°)" if np.isfinite(angle) else f"{i} and {j} (nothing in common)"
-        for i, j, angle in too_wide
-    )
-    if pairs:
-        if too_wide:
-            context.warn(f"Left out of the flow, as the views are too far apart ({limit}): {wide}.")
-    elif too_wide:
-        context.warn(
-            f"No two neighbouring views are close enough for optical flow ({limit}): {wide}. The "
-            "fit goes on without its flow term, on colour alone. More photographs in between would "
-            "help."
-        )
-    else:
+    """Tell of gaps in a sweep. Of a few photographs far apart nobody expects flow."""
+    if not pairs and not too_wide:
         context.warn(
             f"Optical flow needs two views whose cameras are known; of {views} views, {placed} "
             "have one. The fit goes on without its flow term, on colour alone."
+        )
+    elif pairs > len(too_wide) > 0:
+        wide = ", ".join(
+            f"{i} and {j} ({angle:.0f}°)"
+            if np.isfinite(angle)
+            else f"{i} and {j} (nothing in common)"
+            for i, j, angle in too_wide
+        )
+        context.warn(
+            f"Left out of the flow, as the views are too far apart "
+            f"(flow.max_angle={context.config.max_angle:g}°): {wide}."
         )

@@ -148,36 +148,44 @@ def test_pairs_follow_the_cameras_not_the_names(tmp_path: Path) -> None:
 
 
 def test_unplaced_views_and_wide_pairs_are_left_out(tmp_path: Path) -> None:
-    shots = shoot(0, 10, 50, -10, width=64, height=48)
+    shots = shoot(0, 10, 20, 60, -10, width=64, height=48)
     local = context(tmp_path, shots, max_angle=30)
-    local.inputs = {**local.inputs, "cameras": Cameras(tuple(shot[0] for shot in shots[:3]))}
+    local.inputs = {**local.inputs, "cameras": Cameras(tuple(shot[0] for shot in shots[:4]))}
     flow = run(local)
-    assert [(p.name_i, p.name_j) for p in flow.pairs] == [("000", "001")]
+    assert [(p.name_i, p.name_j) for p in flow.pairs] == [("000", "001"), ("001", "002")]
     assert len(local.warnings) == 1
-    assert "001 and 002" in local.warnings[0]
+    assert "002 and 003" in local.warnings[0]
     assert local.figures["pairs_too_wide"] == 1
 
 
-@pytest.mark.parametrize(
-    ("angles", "config", "message"),
-    [((0, 20, 40), {"max_angle": 15}, "close enough"), ((0,), {}, "two views")],
-)
-def test_no_pair_gives_an_empty_flow_and_says_why(
-    tmp_path: Path, angles: tuple[float, ...], config: dict[str, float], message: str
-) -> None:
-    local = context(tmp_path, shoot(*angles, width=64, height=48), **config)
+def test_a_single_view_gives_an_empty_flow_and_says_why(tmp_path: Path) -> None:
+    local = context(tmp_path, shoot(0, width=64, height=48))
     assert len(run(local)) == 0
     assert len(local.warnings) == 1
-    assert message in local.warnings[0]
-    assert local.figures["pairs"] == 0
+    assert "two views" in local.warnings[0]
 
 
-def test_flow_that_cannot_be_trusted_is_said(tmp_path: Path) -> None:
-    shots = shoot(-4, 4, width=64, height=48)
-    mask = np.zeros((48, 64), bool)
+def test_of_photographs_far_apart_no_flow_is_expected(tmp_path: Path) -> None:
+    local = context(tmp_path / "none", shoot(0, 20, 40, width=64, height=48), max_angle=15)
+    assert len(run(local)) == 0
+    assert local.warnings == []
+    assert (local.figures["pairs"], local.figures["pairs_too_wide"]) == (0, 2)
+    local = context(tmp_path / "poor", mostly_masked(shoot(-20, 20, width=64, height=48)))
+    assert len(run(local)) == 1
+    assert local.figures["trusted_share"] < 0.1
+    assert local.warnings == []
+
+
+def mostly_masked(shots: list[Shot]) -> list[Shot]:
+    """Of the second photograph a small piece is left."""
+    first, (camera, view, depth) = shots
+    mask = np.zeros((view.height, view.width), bool)
     mask[20:28, 28:36] = True
-    camera, view, depth = shots[1]
-    local = context(tmp_path, [shots[0], (camera, replace(view, mask=mask), depth)])
+    return [first, (camera, replace(view, mask=mask), depth)]
+
+
+def test_flow_between_near_views_that_cannot_be_trusted_is_said(tmp_path: Path) -> None:
+    local = context(tmp_path, mostly_masked(shoot(-4, 4, width=64, height=48)))
     run(local)
     assert len(local.warnings) == 1
     assert "000 and 001" in local.warnings[0]
