@@ -71,15 +71,7 @@ def test_outputs_agree_with_each_other_and_lead_back_to_millimetres(tmp_path, mo
     normals = context.result("points").normals @ to_mm[:3, :3].T
     cosine = (normals * positions).sum(1) / np.linalg.norm(normals, axis=1) / 20
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
-    assert len(context.result("pointmaps")) == 2  # right - frontal, frontal - left
-    for pair in context.result("pointmaps"):
-        world = np.linalg.inv(cameras.by_name()[pair.name_i].cam_from_world)
-        for points, confidence in (
-            (pair.points_i, pair.confidence_i), (pair.points_j_in_i, pair.confidence_j)
-        ):  # fmt: skip
-            seen = points[confidence > 1] @ world[:3, :3].T + world[:3, 3]
-            mm = seen @ to_mm[:3, :3].T + to_mm[:3, 3]
-            np.testing.assert_allclose(np.linalg.norm(mm, axis=1), 20, atol=2e-3)
+    assert len(context.result("pointmaps")) == 0  # the surface is one already
     assert sorted(context.result("pictures").images) == ["surface_turned"]
     assert sorted(context.result("teeth").pictures) == ["000", "001", "002"]
     assert any("textbook teeth" in warning for warning in context.warnings)

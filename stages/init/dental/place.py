@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +16,6 @@ from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.teeth import Teeth as TeethArtifact
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
-from pipeline.geometry import cloud
-from pipeline.geometry.graph import Pair
 from pipeline.stage import StageContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
@@ -195,7 +192,6 @@ def _write(
     rotation = world_from_mm[:3, :3] / scale
     maps = [surface.views[k] for k in order]
     depths = [(found.depth * scale).astype(np.float32) for found in maps if found]
-    confidences = [found.confidence for found in maps if found]
     points = Points(
         positions=placement.points.astype(np.float32),
         colors=surface.colors,
@@ -203,22 +199,17 @@ def _write(
         confidence=surface.confidence,
         scale=np.full(len(surface.positions), config.dental.cloud_spacing * scale, np.float32),
     )
-    cameras = placement.cameras
-    pairs = [
-        cloud.pointmap_pair(
-            cameras[i], cameras[j], depths[i], depths[j], confidences[i], confidences[j]
-        )
-        for i, j in neighbours(cameras)
-    ]
     mouth = mouth_frame(
         {
             (mark.kind, mark.tooth): scale * rotation @ place + world_from_mm[:3, 3]
             for mark, place in teeth.fit.landmarks.items() if mark.kind in ("tip", "zenith")
         }
     )  # fmt: skip
+    # The cloud has each piece of the one surface once, and evenly. Pointmaps of it, for `align` to
+    # fuse, would lose what one photograph sees close behind what another one shows.
     save_all(
         context, views, placement.views,
-        replace(placement.placed(), mouth_from_world=mouth), depths, points, pairs, numbered,
+        replace(placement.placed(), mouth_from_world=mouth), depths, points, [], numbered,
     )  # fmt: skip
     context.save(Pictures({"surface_turned": teeth.turned}))
     context.summarize(
@@ -264,13 +255,6 @@ def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
         "teeth_confidence": round(teeth.fit.confidence, 3),
         "landmark_error_px": round(float(np.median([view.error for view in placed])), 2),
     }
-
-
-def neighbours(cameras: tuple[Camera, ...]) -> list[Pair]:
-    """Each camera with the next one around the arch, as pairs of positions."""
-    sideways = [camera.centre[0] for camera in cameras]
-    around = sorted(range(len(cameras)), key=lambda number: (sideways[number], number))
-    return sorted((min(i, j), max(i, j)) for i, j in pairwise(around))
 
 
 def arch_options(config: DentalConfig, views: Views) -> ArchOptions:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from pipeline.artifacts.teeth import Dentition, moved_polygons
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry import cloud
+from pipeline.geometry.graph import Pair
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.geometry.world import similarity_between
 from pipeline.stage import StageContext
@@ -27,7 +29,6 @@ from stages.init.dental.cameras.centred import CentredView, centre_view
 from stages.init.dental.place import (
     arch_options,
     masked,
-    neighbours,
     numbered_otherwise,
     surface_options,
     tooth_counts,
@@ -242,7 +243,7 @@ def _write(
         cloud.pointmap_pair(
             cameras[i], cameras[j], depths[i], depths[j], dense[i].confidence, dense[j].confidence
         )
-        for i, j in neighbours(cameras)
+        for i, j in _neighbours(cameras)
     ]
     shown = tuple(
         masked(view, found.depth) if masks else view
@@ -254,6 +255,13 @@ def _write(
     )  # fmt: skip
     context.save(Pictures({"surface_turned": teeth.turned}))
     context.summarize(dense="teeth", dense_points=len(points), **tooth_counts(teeth))
+
+
+def _neighbours(cameras: tuple[Camera, ...]) -> list[Pair]:
+    """Each camera with the next one around the arch, as pairs of positions."""
+    sideways = [camera.centre[0] for camera in cameras]
+    around = sorted(range(len(cameras)), key=lambda number: (sideways[number], number))
+    return sorted((min(i, j), max(i, j)) for i, j in pairwise(around))
 
 
 def world_from_arch(fit: ArchFit, cameras: Sequence[Camera]) -> tuple[float, Array, Array]:
