@@ -75,6 +75,7 @@ def coloured_cloud(
     photos: list[Photo],
     shown: list[Photo],
     nearest: list[Array32],
+    clear: list[Mask | None],
     anchor: int,
     options: SurfaceOptions,
     threads: int,
@@ -86,11 +87,15 @@ def coloured_cloud(
         photos: the photographs, to tell what hides what.
         shown: the same at the size that colours are taken from.
         nearest: per photograph the z-depth [h, w] of the nearest chart.
+        clear: per chart where it may be kept, [H, W] bool; None: everywhere.
         anchor: the photograph whose exposure the others are brought to.
         options: settings.
         threads: number of threads.
     """
-    layers = [_layer(chart, photos, shown, nearest, options, threads) for chart in charts]
+    layers = [
+        _layer(chart, photos, shown, nearest, seen, options, threads)
+        for chart, seen in zip(charts, clear, strict=True)
+    ]
     gains = find_gains(
         [[showing.colour for showing in layer.showings] for layer in layers],
         [layer.weights for layer in layers],
@@ -140,6 +145,7 @@ def _layer(
     photos: list[Photo],
     shown: list[Photo],
     nearest: list[Array32],
+    clear: Mask | None,
     options: SurfaceOptions,
     threads: int,
 ) -> _Layer:
@@ -156,6 +162,8 @@ def _layer(
     showings = in_threads(look, zip(photos, shown, nearest, strict=True), threads)
     gum, edge = beyond_crowns(grid, chart.shape)
     allowed = (gum < options.gum_height) & (edge < PAST_EDGE)
+    if clear is not None:
+        allowed &= chart.grid.resample(clear.astype(np.float32), grid) > 0.5
     kept, tooth = find_tissue(showings, grid.density, options.rim_smoothing, options.least_showing)
     kept = even_rim(kept & allowed, tooth > 0.5, gum, grid.density)
     weights = photo_weights(showings, kept, grid.density, options.colour_power)

@@ -138,8 +138,8 @@ def dense_surface(
         progress("colour", steps - 1, steps)
         looked = _look_at(charts, photos, full, options, threads)
         cloud = coloured_cloud(
-            charts, looked.photos, looked.shown, looked.nearest, _anchor(photos, fit), options,
-            threads,
+            charts, looked.photos, looked.shown, looked.nearest, looked.clear,
+            _anchor(photos, fit), options, threads,
         )  # fmt: skip
         progress("colour", steps, steps)
     gains = np.ones((len(images), 3))
@@ -225,12 +225,14 @@ class _Looked:
         photos: what is tooth and gum in each photograph, at the size that was worked at.
         shown: the same at the size that depths and colours are wanted in.
         nearest: per photograph the z-depth [h, w] of the nearest chart.
+        clear: per chart where it is seen clearly, [H, W] bool; None: everywhere.
         looks: the surface in each of `shown`.
     """
 
     photos: list[Photo]
     shown: list[Photo]
     nearest: list[Array32]
+    clear: list[Mask | None]
     looks: list[SurfaceView]
 
     def views_of(self, count: int) -> tuple[SurfaceView | None, ...]:
@@ -265,7 +267,7 @@ def _look_at(
         for chart in charts
     ]
     looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
-    return _Looked(photos, shown, nearest, looks)
+    return _Looked(photos, shown, nearest, clear, looks)
 
 
 def _sweep(
