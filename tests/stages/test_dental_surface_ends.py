@@ -97,19 +97,24 @@ def test_among_front_teeth_the_other_jaw_tells_as_well(
 
 
 @pytest.mark.parametrize("only_clear", [True, False])
-def test_what_all_photographs_see_at_a_low_angle_has_no_depth(only_clear: bool) -> None:
+def test_what_all_photographs_see_at_a_low_angle_is_no_surface(only_clear: bool) -> None:
     """One photograph, from the right: the arch turns away from it on the left."""
     images, valid, dentitions, fit, truth = scene()
     view = fit.views[0]
     alone = replace(fit, views=(view, None, None))
     options = SurfaceOptions(rounds=(), only_clear=only_clear)
-    shown = dense_surface(images, valid, dentitions, alone, options).views[0].depth > 0
+    surface = dense_surface(images, valid, dentitions, alone, options)
+    shown = surface.views[0].depth > 0
     depth, _, kind = truth[0]
     angle = angles(depth, view.cam_from_world)
     away, towards = (kind == 2) & (angle > 0.6), (kind == 2) & (angle < 0.2)
     assert away.sum() > 50
     assert shown[towards].mean() > 0.95
     assert shown[away].mean() < 0.15 if only_clear else shown[away].mean() > 0.5
+    # nor does the cloud go on where the photograph has no depth
+    x, _, z = surface.positions[surface.tooth].T
+    beyond = np.mean(np.arctan2(x, z + AXIS) > 0.6)
+    assert beyond == 0 if only_clear else beyond > 0.02
 
 
 def test_what_a_better_facing_photograph_does_not_show_needs_a_good_angle() -> None:
