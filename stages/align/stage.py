@@ -261,6 +261,11 @@ def _kept(context: StageContext) -> bool:
     cameras, points = context.load("cameras"), context.load("points")
     if len(cameras) < 2 or len(points) == 0:
         return False
+    if context.config.refine == "always":
+        context.warn(
+            "align.refine=always changes nothing: there are no pointmaps to refine the cameras by. "
+            "The cameras and points stay as init has them."
+        )
     context.save(cameras)
     context.save(points)
     context.summarize(points=len(points), views=len(cameras), kept="as given, without pointmaps")

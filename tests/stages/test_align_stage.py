@@ -316,6 +316,28 @@ def test_masked_pixels_give_no_points(world, tmp_path):
     assert pixels[:, 0].min() > 59.9
 
 
+@pytest.mark.parametrize("refine", ["auto", "always"])
+def test_points_that_come_without_pointmaps_stay_as_they_are(world, tmp_path, refine):
+    cameras = Cameras(tuple(world[0]))
+    place = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    unit = place / np.linalg.norm(place, axis=1, keepdims=True)
+    points = Points(
+        place, np.full((50, 3), 0.4, np.float32), unit,
+        np.full(50, 1.2, np.float32), np.full(50, 0.1, np.float32),
+    )  # fmt: skip
+    context = run(
+        tmp_path, AlignConfig(refine=refine), views=views_of(world),
+        pointmaps=Pointmaps([]), cameras=cameras, points=points,
+    )  # fmt: skip
+    for name in ("positions", "colors", "normals", "confidence", "scale"):
+        np.testing.assert_array_equal(
+            getattr(context.result("points"), name), getattr(points, name)
+        )
+    assert [c.name for c in context.result("cameras").cameras] == [c.name for c in world[0]]
+    told = [warning for warning in context.warnings if "align.refine=always" in warning]
+    assert bool(told) == (refine == "always")
+
+
 def test_nothing_to_align_is_a_diagnosis(world, tmp_path):
     with pytest.raises(ReconstructionError, match="overlap"):
         run(tmp_path, AlignConfig(), views=views_of(world), pointmaps=Pointmaps([]))
