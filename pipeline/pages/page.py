@@ -41,6 +41,19 @@ def environment(package: str) -> Environment:
     return made
 
 
+def compile_template(package: str, template: str) -> None:
+    """Compile a template, and all that it includes, before it is to be filled."""
+    from jinja2.meta import find_referenced_templates
+
+    templates = environment(package)
+    assert templates.loader is not None
+    templates.get_template(template)
+    source, _, _ = templates.loader.get_source(templates, template)
+    for name in find_referenced_templates(templates.parse(source)):
+        if name is not None:
+            compile_template(package, name)
+
+
 def number(value: Any, digits: int = 2) -> str:
     """A figure for people: ``1,234``, ``0.83``; a dash for what is not known."""
     if value is None:

@@ -15,6 +15,7 @@ from stages.fit.arrays import Floats
 from stages.fit.config import FitSettings
 from stages.fit.inputs.initial import SH_C0, camera_share, facing, headlight_harmonics
 from stages.fit.inputs.scene import Scene
+from stages.fit.numerics.harmonics import Nearest
 from stages.fit.numerics.light import prediction_errors
 from stages.fit.parts.light import Light
 from stages.splatting.harmonics import seen_from
@@ -120,15 +121,12 @@ def harmonics_for_viewers(fit: Trainer, cameras: Sequence[Camera]) -> Floats:
     colours = albedo * (1 - share + share * cosine[:, None])
     matte = headlight_harmonics(colours, normals, cosine, share, s.sh_degree)
     degrees = np.sqrt(np.arange(terms)).astype(int)
-    trust = np.array(MATTE)[degrees]
-    gram = np.tile(np.diag(trust), (len(packed), 1, 1))
-    wanted = trust[:, None] * matte
+    nearest = Nearest(matte, np.array(MATTE)[degrees])
     for view, target in enumerate(fit.targets):
         viewpoint = fit.viewpoint(view, target[1])
         part.shade(packed, viewpoint)
-        basis = seen_from(viewpoint.centre, positions)[:, :terms]
-        gram += basis[:, :, None] * basis[:, None, :]
         # the kernels' constant harmonic
-        wanted += basis[:, :, None] * (SH_C0 * packed[:, None, HARMONICS:])
-    sh = np.linalg.solve(gram, wanted)
-    return np.concatenate([packed[:, :HARMONICS], sh.reshape(len(sh), -1).astype(np.float32)], 1)
+        seen = SH_C0 * packed[:, HARMONICS : HARMONICS + 3]
+        nearest.add(seen_from(viewpoint.centre, positions)[:, :terms], seen)
+    sh = nearest.found.reshape(len(packed), -1).astype(np.float32)
+    return np.concatenate([packed[:, :HARMONICS], sh], 1)

@@ -56,6 +56,20 @@ def test_what_one_photograph_shows_turns_like_what_two_show_beside_it() -> None:
     assert change.mean() == pytest.approx(0.2, abs=0.02)
 
 
+def test_harmonics_nearest_to_what_views_see_are_those_of_least_squares() -> None:
+    rng = np.random.default_rng(4)
+    count, terms, views = 700, 9, 5
+    given, trust = rng.normal(size=(count, terms, 3)), rng.uniform(1e-3, 0.3, terms)
+    basis, wanted = rng.normal(size=(views, count, terms)), rng.normal(size=(views, count, 3))
+    nearest = numerics.harmonics.Nearest(given, trust)
+    for one, seen in zip(basis, wanted, strict=True):
+        nearest.add(one, seen)
+    stacked = np.moveaxis(basis, 0, 1)  # [N, V, K]
+    gram = np.swapaxes(stacked, 1, 2) @ stacked + np.diag(trust)
+    right = np.swapaxes(stacked, 1, 2) @ np.moveaxis(wanted, 0, 1) + trust[:, None] * given
+    np.testing.assert_allclose(nearest.found, np.linalg.solve(gram, right), atol=1e-9)
+
+
 def test_it_is_the_membrane_that_a_dense_solver_finds() -> None:
     of = strip(16)
     of["values"][:, 1:] += np.random.default_rng(2).normal(0, 0.3, (16, 3, 3))

@@ -13,11 +13,10 @@ import os
 import sys
 from pathlib import Path
 
-from pipeline.pages.page import environment
+from pipeline.pages.page import compile_template
 from pipeline.pages.remembered import remember
-from pipeline.studies.report import run_report
+from pipeline.studies.report import check, run, run_report
 from pipeline.studies.report.reading import read_case
-from pipeline.studies.report.run import TEMPLATE, part_of_stage
 
 DRAW, WRITE = "draw\n", "write\n"
 #: How much the stages themselves go before it.
@@ -27,10 +26,11 @@ NICENESS = 10
 def draw_ahead(workspace: Path) -> None:
     """Draw what can be drawn by now; whatever fails is told when the pages are written."""
     with contextlib.suppress(Exception):
-        environment("pipeline.studies.report").get_template(TEMPLATE)
+        for template in (run.TEMPLATE, check.TEMPLATE):
+            compile_template("pipeline.studies.report", template)
         case = read_case(workspace)
         for record in case.stages:
-            part_of_stage(case, record.name)
+            run.part_of_stage(case, record.name)
 
 
 def main(workspace: Path) -> None:

@@ -27,6 +27,7 @@ Content = dict[str, Any]
 
 #: Numbers are marked from this doubt on.
 DOUBTFUL = 0.1
+TEMPLATE = "check.html"
 #: Long side in pixels of a photograph on the page, and of one without teeth.
 LARGE, SMALL = 1280, 480
 #: Numbers offered for a crown.
@@ -54,7 +55,7 @@ def write_check_page(case: Case) -> bool:
     path, corrections, problem = _corrections(case)
     own = path is None or path.parent.resolve() == case.workspace.resolve()
     write_page(
-        "pipeline.studies.report", "check.html", out, title=case.workspace.resolve().name,
+        "pipeline.studies.report", TEMPLATE, out, title=case.workspace.resolve().name,
         data=content(teeth, views, corrections)
         | {"command": command(case), "target": "" if own else str(path)},
         failure=(case.failed.failure or "").partition(" Pictures that show it: ")[0]

@@ -137,5 +137,55 @@ def reaching(harmonics: Floats, basis: Array, wanted: Array, sure: Array) -> Flo
     return found
 
 
+@kernel(parallel=True)
+def _take_in(basis: Array, wanted: Array, open_to: Array, found: Array):  # type: ignore[no-untyped-def]
+    """Recursive least squares: what one more view sees of each; see `Nearest`."""
+    number, terms = basis.shape
+    for chunk in prange((number + CHUNK - 1) // CHUNK):
+        gain = np.empty(terms)
+        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
+            certainty = 1.0
+            for k in range(terms):
+                gain[k] = 0.0
+                for other in range(terms):
+                    gain[k] += open_to[i, k, other] * basis[i, other]
+                certainty += gain[k] * basis[i, k]
+            for c in range(3):
+                missing = wanted[i, c]
+                for k in range(terms):
+                    missing -= basis[i, k] * found[i, k, c]
+                for k in range(terms):
+                    found[i, k, c] += gain[k] * missing / certainty
+            for k in range(terms):
+                for other in range(terms):
+                    open_to[i, k, other] -= gain[k] * gain[other] / certainty
+
+
+class Nearest:
+    """Harmonics that come nearest to what views see, and to given ones in all that these leave.
+
+    Least squares of every Gaussian on its own, view by view (Plackett 1950): no view is kept.
+
+    Attributes:
+        found: [N, K, 3] float64 as things stand.
+    """
+
+    def __init__(self, given: Array, trust: Array) -> None:
+        """
+        Args:
+            given: [N, K, 3].
+            trust: [K] what a difference from them counts, squared, against one from a view.
+        """
+        self.found = given.astype(np.float64)
+        self._open_to = np.empty((*given.shape[:2], given.shape[1]))
+        self._open_to[:] = np.diag(1 / trust)
+
+    def add(self, basis: Array, wanted: Floats) -> None:
+        """A view sees [N, 3] by [N, K], what each coefficient adds to it."""
+        seen_by, seen = (np.ascontiguousarray(array, np.float64) for array in (basis, wanted))
+        with KERNELS:
+            _take_in(seen_by, seen, self._open_to, self.found)
+
+
 def _product(a: Floats, b: Floats) -> float:
     return float((a * b).sum(dtype=np.float64))

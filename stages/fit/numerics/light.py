@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: shares of light from the lens that are tried, the first of them none
 SHARES = np.linspace(0, 0.95, 20)
 #: points that are compared at most; photographs share the surface if they share so many of them
-MOST_POINTS, LEAST_SHARED = 40000, 200
+MOST_POINTS, LEAST_SHARED = 10000, 200
 #: neighbours that a normal is averaged over: shading is compared over some pixels, not over one
 NEIGHBOURS = 25
 #: the photographs' blur (px) for the same reason
