@@ -17,6 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import sha256_file
 from pipeline.installed import ROOT, module_command
 from pipeline.pages.page import CHECK, REPORT
+from pipeline.process.native import ONE_THREAD
 from pipeline.running.reporter import Reporter
 from pipeline.store import MANIFEST, Store, read_own, write_sealed
 
@@ -57,8 +58,11 @@ class DrawnBeside:
             return
         if self._process is None:
             command = [*module_command("pipeline.studies.report.beside"), str(self._workspace)]
-            # what this process found its plug-ins by
-            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            environment = {
+                **os.environ, **ONE_THREAD,
+                # what this process found its plug-ins by
+                "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+            }  # fmt: skip
             with suppress(OSError):
                 self._process = subprocess.Popen(
                     command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from pipeline.kernels import folder as places
 from pipeline.kernels.folder import SUFFIX
+from pipeline.process.native import ONE_THREAD
 from pipeline.process.signals import child
 
 #: how much the run itself goes before
@@ -85,7 +86,7 @@ def _process(names: Sequence[str]) -> subprocess.Popen[bytes]:
         **os.environ,
         "PYTHONPATH": os.pathsep.join([here, *filter(None, sys.path)]),
         # nothing here is worth a second thread
-        "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1", **ONE_THREAD,
     }  # fmt: skip
     return subprocess.Popen(
         [sys.executable, "-P", "-m", __spec__.name, *names], env=environment,

@@ -36,6 +36,11 @@ MEDDLERS: dict[str, Callable[[Any], None]] = {
 }  # fmt: skip
 
 
+#: Environment of a process that does small work beside others: the threads of these libraries wait
+#: for work by going round in circles.
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
 @contextmanager
 def signals_held() -> Iterator[None]:
     """Signals to end that come meanwhile are heard afterwards; threads started inside hear none."""

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.measure import confine
+from pipeline.process.native import ONE_THREAD
 from pipeline.untrusted.files import UnusableFile
 
 Values = dict[str, Any]
@@ -64,7 +65,7 @@ class Child:
             **os.environ,
             "PYTHONPATH": os.pathsep.join([home, *filter(None, sys.path)]),
             # each arena and each thread's stack would count as memory
-            "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+            "MALLOC_ARENA_MAX": "2", **ONE_THREAD,
         }  # fmt: skip
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "pipeline.untrusted.child", work, str(memory)],

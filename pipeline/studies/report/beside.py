@@ -23,23 +23,30 @@ DRAW, WRITE = "draw\n", "write\n"
 NICENESS = 10
 
 
-def draw_ahead(workspace: Path) -> None:
-    """Draw what can be drawn by now; whatever fails is told when the pages are written."""
+def draw_ahead(workspace: Path, drawn: set[Path]) -> None:
+    """Draw what can be drawn by now; whatever fails is told when the pages are written.
+
+    Args:
+        drawn: folders of the results that have been; those added are entered.
+    """
     with contextlib.suppress(Exception):
         for template in (run.TEMPLATE, check.TEMPLATE):
             compile_template("pipeline.studies.report", template)
         case = read_case(workspace)
         for record in case.stages:
-            run.part_of_stage(case, record.name)
+            if record.result is not None and record.result.folder not in drawn:
+                drawn.add(record.result.folder)
+                run.part_of_stage(case, record.name)
 
 
 def main(workspace: Path) -> None:
     with contextlib.suppress(AttributeError):  # Windows has none
         os.nice(NICENESS)
     remember()
+    drawn: set[Path] = set()
     for line in sys.stdin:
         if line == DRAW:
-            draw_ahead(workspace)
+            draw_ahead(workspace, drawn)
         elif line == WRITE:
             error = None
             try:
