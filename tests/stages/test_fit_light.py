@@ -81,6 +81,27 @@ def test_a_light_has_to_leave_little_unexplained(
     assert here.figures["light"] == light
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_a_trial_tells_one_light_from_exposures_of_each_photograph(
+    own: bool, tmp_path, monkeypatch
+) -> None:
+    """Both shade what they share about as well: .061 of .093 on three real photographs."""
+    monkeypatch.setattr("stages.fit.lighting.prediction_errors", lambda *_: (0.093, 0.061))
+    views, cameras, points, _ = case(lit=True, shine=0.1)
+    gains = np.array([[1, 1, 1], [0.6, 0.7, 0.85], [1.3, 1.1, 1]], np.float32)
+    few = Views(
+        views=tuple(
+            View(view.name, np.clip(view.image * (gain if own else 1), 0, 1))
+            for view, gain in zip(views.views[::2], gains, strict=True)
+        )
+    )
+    here = context(tmp_path, few, cameras, points, light="auto", iterations=2, hold_surface=True)
+    FitStage().run(here)
+    assert here.figures["light"] == ("none" if own else "camera")
+    if own:
+        assert here.figures["light_trial_camera"] < here.figures["light_trial_none"] - 2
+
+
 def test_nothing_is_concluded_where_no_surface_is_shared(tmp_path) -> None:
     views, cameras, points, _ = case(lit=True)
     apart = []
