@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.init.dental.surface.chart.jaws import _scraps
+from stages.init.dental.surface.chart.crown_shape import crown_points, crown_radius, jaw_shape
+from stages.init.dental.surface.chart.grid import grid_around
+from stages.init.dental.surface.chart.jaws import Chart, _scraps, comparable, nearest_depths
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.ends import _with_hidden_fronts
 from stages.init.dental.surface.options import SurfaceOptions
@@ -23,6 +25,7 @@ from tests.stages.dental_arch_scene import (
     outline,
     scene,
 )
+from tests.stages.dental_surface_case import photo, row_of_teeth
 
 #: Where the patient's last upper tooth on the right begins: four to either side.
 END = -3 * CROWN_ANGLE
@@ -148,3 +151,26 @@ def test_a_scrap_smaller_than_a_tooth_and_its_gum_is_none_of_the_surface() -> No
     np.testing.assert_array_equal(_scraps(row | tooth | scrap, 2.0), scrap)
     assert not _scraps(scrap, 2.0).any()
     assert not _scraps(np.zeros_like(row), 2.0).any()
+
+
+def test_what_is_compared_lies_within_its_own_jaw() -> None:
+    """Windows that reach over the biting edges would see what is behind them."""
+    marks = row_of_teeth()
+    shape = jaw_shape("upper", marks, {mark.tooth for mark in marks}, set())
+    assert shape is not None
+    points = crown_points(shape, 0.8, 2.6)
+    grid = grid_around(points, 1.0, 4.0)
+    chart = Chart(shape, grid, crown_radius(grid, points, 0.3), np.zeros(grid.shape, np.float32))
+    view = photo()
+    teeth = np.zeros(view.size, np.float32)
+    teeth[:25] = 1
+    view = replace(view, upper=teeth, lower=1 - teeth)
+    options = SurfaceOptions()
+    front = nearest_depths([chart], [view], options.gum_height, 1)
+    _, rows = np.moveaxis(view.project(chart.points)[0], -1, 0)
+    (within,) = comparable(chart, [view], front, options, 2.0)
+    (about,) = comparable(chart, [view], front, options, -0.5)
+    assert within.sum() > 300
+    assert rows[within].max() < 25 - 2.0 * view.density + 1
+    assert rows[about].max() > 25
+    assert about[within].all()

@@ -25,6 +25,7 @@ from stages.init.dental.surface.chart.hardware import (
     shows_hardware,
 )
 from stages.init.dental.surface.chart.jaws import (
+    OUTLINE_ERROR,
     PAST_EDGE,
     Chart,
     clearly_seen,
@@ -281,7 +282,9 @@ def _sweep(
 ) -> None:
     """One round over all charts, in place; the first one looks for brackets as well."""
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
-    seen = [comparable(chart, photos, nearest, options) for chart in charts]
+    # A window that reaches over the biting edges compares what lies behind them as well.
+    inset = settings.window / 2
+    seen = [comparable(chart, photos, nearest, options, inset) for chart in charts]
     for chart, shown in zip(charts, seen, strict=True):
         trust = chart.gum_fades(options.gum_trust)
         if first:
@@ -307,7 +310,8 @@ def _raise(
         nearest = nearest_depths(charts, photos, options.gum_height, threads)
         for chart in charts:
             if chart.hardware:
-                raise_hardware(chart, photos, comparable(chart, photos, nearest, options), pairs)
+                seen = comparable(chart, photos, nearest, options, -OUTLINE_ERROR)
+                raise_hardware(chart, photos, seen, pairs)
 
 
 def _anchor(photos: list[Photo], fit: ArchFit) -> int:

@@ -49,7 +49,7 @@ _GUM_FADES = (0.5, 2.0)
 #: No tooth with the gum that goes with it is smaller (square mm; a lower incisor and 10 mm of gum).
 _TOOTH_AND_GUM = 100.0
 #: Tissue is looked for this far around its outline (mm), for the cameras' errors.
-_OUTLINE_ERROR = 0.5
+OUTLINE_ERROR = 0.5
 
 
 @dataclass
@@ -171,14 +171,20 @@ def comparable(
     photos: list[Photo],
     nearest: list[Array32],
     options: SurfaceOptions,
+    inset: float,
 ) -> npt.NDArray[np.bool_]:
-    """[V, H, W] bool: samples of a chart that a photograph shows well enough to compare."""
+    """[V, H, W] bool: samples of a chart that a photograph shows well enough to compare.
+
+    Args:
+        inset: how far within the jaw's tissue they have to lie (mm); below 0: how far beyond it
+            they may.
+    """
     points = chart.points
     normals = smooth_normals(chart.radius, chart.grid, FACING_SMOOTHING)
     used = chart.used(PAST_EDGE, options.gum_height)
     masks = []
     for photo, front in zip(photos, nearest, strict=True):
-        tissue = _near_tissue(photo, chart.shape.jaw)
+        tissue = _tissue_within(photo, chart.shape.jaw, inset)
         shown = photo.sample(tissue, photo.project(points)[0]) > 0.5
         faces = facing(photo, points, normals) > options.least_facing
         masks.append(used & shown & faces & sees(photo, front, points, 2 * HIDDEN))
@@ -221,7 +227,8 @@ def _scraps(mask: Mask, density: float) -> Mask:
     return mask & (area < min(_TOOTH_AND_GUM * density**2, area.max()))[label]
 
 
-def _near_tissue(photo: Photo, jaw: Jaw) -> Array32:
-    """[h, w] float32: this jaw's teeth and gum and what is next to them."""
+def _tissue_within(photo: Photo, jaw: Jaw, inset: float) -> Array32:
+    """[h, w] float32: this jaw's teeth and gum less so many mm of their rim, or more."""
     tissue = np.maximum(photo.tooth_of(jaw), photo.gum_of(jaw))
-    return np.asarray(cv2.dilate(tissue, disc(_OUTLINE_ERROR * photo.density)), np.float32)
+    change = cv2.erode if inset > 0 else cv2.dilate
+    return np.asarray(change(tissue, disc(abs(inset) * photo.density)), np.float32)
