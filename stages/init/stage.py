@@ -25,7 +25,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 38
+    version = 39
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

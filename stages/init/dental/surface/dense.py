@@ -282,9 +282,7 @@ def _sweep(
 ) -> None:
     """One round over all charts, in place; the first one looks for brackets as well."""
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
-    # A window that reaches over the biting edges compares what lies behind them as well.
-    inset = settings.window / 2
-    seen = [comparable(chart, photos, nearest, options, inset) for chart in charts]
+    seen = [comparable(chart, photos, nearest, options, settings.inset) for chart in charts]
     for chart, shown in zip(charts, seen, strict=True):
         trust = chart.gum_fades(options.gum_trust)
         if first:

@@ -16,13 +16,7 @@ from scipy import ndimage
 
 from stages.init.dental.surface.chart.crown_shape import beyond_crowns
 from stages.init.dental.surface.chart.grid import ChartGrid
-from stages.init.dental.surface.chart.jaws import (
-    OUTLINE_ERROR,
-    PAST_EDGE,
-    Chart,
-    comparable,
-    nearest_depths,
-)
+from stages.init.dental.surface.chart.jaws import PAST_EDGE, Chart, comparable, nearest_depths
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photos.photo import Photo
 from stages.init.dental.surface.sweep import match, sweep
@@ -85,9 +79,11 @@ def _sweep_strip(
     new = used & (beyond > 0)
     trust = np.ones(part.radius.shape, np.float32)
 
+    inset = options.grow_round.inset
+
     def bent(bend: Array32 | float) -> tuple[Array32, list[Photo], Mask]:
         chart = replace(part, radius=(part.radius + bend * beyond).astype(np.float32))
-        return chart.radius, photos, comparable(chart, photos, nearest, options, -OUTLINE_ERROR)
+        return chart.radius, photos, comparable(chart, photos, nearest, options, inset)
 
     count = np.maximum(new.sum(axis=0), 1)
     agreements = []

@@ -15,6 +15,10 @@ class SweepRound:
         window: side of the correlation window, mm on the chart.
         prior: cost of an offset of 2 mm: how much the surface swept around is believed.
         stiffness: of the fit to the offsets found; larger is smoother.
+        inset: how far within their jaw's tissue samples have to lie to be compared, mm; below 0:
+            how far beyond it they may. A window that reaches over the biting edges also compares
+            what lies behind them: it finds edges that are far off, and draws upper ones in and
+            lower ones out.
     """
 
     reach: float
@@ -22,6 +26,7 @@ class SweepRound:
     window: float
     prior: float
     stiffness: float
+    inset: float = -0.5
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class SurfaceOptions:
     # rounds of the sweep, coarse to fine; none: the crown shape as it is
     rounds: tuple[SweepRound, ...] = (
         SweepRound(reach=3.0, step=0.15, window=1.2, prior=0.3, stiffness=5.0),
-        SweepRound(reach=1.5, step=0.075, window=0.8, prior=0.15, stiffness=2.0),
+        SweepRound(reach=1.5, step=0.075, window=0.8, prior=0.15, stiffness=2.0, inset=0.4),
     )
     # penalties of semi-global matching: one plane, and more, per unit of 1 - correlation
     sgm_p1: float = 0.1
