@@ -32,8 +32,8 @@ QUICK = {
     "opacity_reset_interval": 0, "sh_degree_interval": 0,
 }  # fmt: skip
 #: steps of a trial on a held surface, and by how much more error (RMS, 0..1) a light may leave than
-#: none. It is .0014 more at most where there is one (sixteen triples of the samples and the scan
-#: video, neighbours 9 to 35 degrees apart), and .0042 to .035 more on thirteen sets of real
+#: none. It is .0014 more at most where there is one (seventeen triples of the samples and the scan
+#: video, neighbours 9 to 48 degrees apart), and .0042 to .035 more on thirteen sets of real
 #: photographs, .0063 and more on those that look lit
 FIRST_STEPS, FIRST_MARGIN = 80, 0.0025
 #: how much a matte surface counts against one camera, for harmonics of each degree
