@@ -147,8 +147,8 @@ def _leave(status: int) -> NoReturn:
     threading._shutdown()  # type: ignore[attr-defined]  # waits for threads, as an exit does
     atexit._run_exitfuncs()
     try:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            stream.flush()
     except (OSError, ValueError):  # nobody listens any more: it has its own status for that
         sys.exit(status)
     os._exit(status)
