@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +47,9 @@ PHOTOS = "0_right,1_frontal,2_left"
 SIZE = (512, 384)
 #: Share of the pairs that an alignment is made of; the rest are outliers.
 KEPT = 85
+#: Relief is what is left of the mean over so much (mm), where it is no more than a step between
+#: crowns, and where the surface is that of the same crown (mm).
+RELIEF, STEEP, ELSEWHERE = 2.0, 1.5, 4.0
 
 
 class Scan:
@@ -250,25 +254,12 @@ def surface_scores(
 ) -> tuple[float, float, float, float]:
     """Median and 90 % of the distance of tooth depths to the scan after similarity and ICP, mm;
     share within 1 mm; share of the tooth pixels that have depth."""
-    found, truth, covered, shown = [], [], 0, 0
-    for number, (camera, view, dentition) in enumerate(
-        zip(case.cameras, teeth.surface.views, teeth.dentitions, strict=True)
-    ):
-        if view is None or dentition is None or teeth.fit.views[number] is None:
-            continue
-        ours = _camera(teeth, number)
-        ids, points = scan.look(camera)
-        tooth = _tooth_pixels(case, ids, dentition)
-        covered += int((tooth & (view.depth > 0)).sum())
-        shown += int(tooth.sum())
-        both = tooth & (view.depth > 0) & np.isfinite(points[..., 0])
-        found.append(ours.unproject(view.depth)[both])
-        truth.append(points[both])
-    source, target = np.concatenate(found), np.concatenate(truth)
+    seen = list(_seen(case, scan, teeth))
+    covered, shown = sum(int(s.both.sum()) for s in seen), sum(s.shown for s in seen)
+    source = np.concatenate([s.found[s.both] for s in seen])
+    target = np.concatenate([s.truth[s.both] for s in seen])
     drawn = np.random.default_rng(0).permutation(len(source))[:15_000]
-    motion = similarity(source, target, np.ones(len(source)))
-    for _ in range(5):
-        motion = _best(source, target, motion)
+    motion = _aligned(source, target)
     for _ in range(25):
         nearest = scan.nearest(_moved(source[drawn], motion))
         motion = _best(source[drawn], nearest, motion)
@@ -280,6 +271,62 @@ def surface_scores(
     )  # fmt: skip
 
 
+def relief_scores(case: Case, scan: Scan, teeth: Reconstruction) -> tuple[float, float]:
+    """How much of the crowns' relief is there (1: all of it), and by how much it is off (RMS, mm).
+
+    Relief is how far a pixel's point is from the camera, less the mean of some 2 mm around it.
+    """
+    seen = list(_seen(case, scan, teeth))
+    motion = _aligned(
+        np.concatenate([s.found[s.both] for s in seen]),
+        np.concatenate([s.truth[s.both] for s in seen]),
+    )
+    found, truth = [], []
+    for s in seen:
+        points = _moved(s.found.reshape(-1, 3), motion).reshape(s.found.shape)
+        ours, true = (np.linalg.norm(p - s.camera.centre, axis=-1) for p in (points, s.truth))
+        near = s.both & (np.abs(ours - true) < ELSEWHERE)
+        reach = RELIEF * s.camera.fx / float(np.median(true[near]))
+        ours, true = (_less_mean(distance, near, reach) for distance in (ours, true))
+        kept = near & (np.abs(true) < STEEP)
+        found.append(ours[kept])
+        truth.append(true[kept])
+    one, other = np.concatenate(found), np.concatenate(truth)
+    return float(one @ other / (other @ other)), float(np.sqrt(np.mean((one - other) ** 2)))
+
+
+def _less_mean(values: Array, mask: npt.NDArray[np.bool_], reach: float) -> Array:
+    """Values [H, W] less their Gaussian mean within a mask."""
+    total = cv2.GaussianBlur(np.where(mask, values, 0), (0, 0), reach)
+    weight = cv2.GaussianBlur(mask.astype(np.float64), (0, 0), reach)
+    return np.asarray(values - total / np.maximum(weight, 1e-9))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a photograph shows: points [H, W, 3] found and true, where there are both, and on how
+    many pixels it shows teeth."""
+
+    camera: Camera
+    found: Array
+    truth: Array
+    both: npt.NDArray[np.bool_]
+    shown: int
+
+
+def _seen(case: Case, scan: Scan, teeth: Reconstruction) -> Iterator[Seen]:
+    for number, (camera, view, dentition) in enumerate(
+        zip(case.cameras, teeth.surface.views, teeth.dentitions, strict=True)
+    ):
+        if view is None or dentition is None or teeth.fit.views[number] is None:
+            continue
+        ids, points = scan.look(camera)
+        tooth = _tooth_pixels(case, ids, dentition)
+        both = tooth & (view.depth > 0) & np.isfinite(points[..., 0])
+        found = _camera(teeth, number).unproject(view.depth)
+        yield Seen(camera, found, points, both, int(tooth.sum()))
+
+
 def _tooth_pixels(case, ids, dentition):  # type: ignore[no-untyped-def]
     """Where the photograph shows teeth: by the scan where the camera is exact, else as found."""
     tooth = dentition.mask if case.name == PHOTOS else ids > 0
@@ -288,6 +335,14 @@ def _tooth_pixels(case, ids, dentition):  # type: ignore[no-untyped-def]
 
 def _moved(points: Array, motion: tuple[float, Array, Array]) -> Array:
     return motion[0] * points @ motion[1].T + motion[2]
+
+
+def _aligned(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """The similarity that brings most of the pairs together."""
+    motion = similarity(source, target, np.ones(len(source)))
+    for _ in range(5):
+        motion = _best(source, target, motion)
+    return motion
 
 
 def _best(source, target, motion):  # type: ignore[no-untyped-def]
@@ -315,9 +370,9 @@ def main() -> None:
     print(
         "| set | labels right / wrong / none | margin | rotation, degrees | focal off, % | "
         "epipolar error of landmarks, px: found / truth | surface median / p90, "
-        "mm | within 1 mm | covered | CPU s | wall s |"
+        "mm | within 1 mm | covered | relief: share / off, mm | CPU s | wall s |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for names in sets:
         case = read_case(options.data, names, options.long_side)
         cpu, wall = time.process_time(), time.perf_counter()
@@ -336,10 +391,11 @@ def main() -> None:
         focals = " ".join(f"{error:+.0f}" for error in focal_errors(case, teeth.fit.views))
         epipolar = " / ".join(f"{error:.1f}" for error in epipolar_errors(case, teeth))
         median, most, within, covered = surface_scores(case, scan, teeth)
+        share, off = relief_scores(case, scan, teeth)
         cells = (
             names, labels, f"{teeth.fit.margin:.0f}", errors, focals, epipolar,
             f"{median:.3f} / {most:.2f}", f"{100 * within:.0f} %", f"{100 * covered:.1f} %",
-            f"{cpu:.1f}", f"{wall:.1f}",
+            f"{share:.2f} / {off:.3f}", f"{cpu:.1f}", f"{wall:.1f}",
         )  # fmt: skip
         print(f"| {' | '.join(cells)} |", flush=True)
         if options.pictures:

@@ -31,11 +31,6 @@ QUICK = {
     "coarse_fraction": 0.0, "detail": False, "extension": 0.0, "lambda_flow": 0.0, "densify": False,
     "opacity_reset_interval": 0, "sh_degree_interval": 0,
 }  # fmt: skip
-#: steps of a trial on a held surface, and by how much more error (RMS, 0..1) a light may leave than
-#: none. It is .0014 more at most where there is one (seventeen triples of the samples and the scan
-#: video, neighbours 9 to 48 degrees apart), and .0042 to .035 more on thirteen sets of real
-#: photographs, .0063 and more on those that look lit
-FIRST_STEPS, FIRST_MARGIN = 80, 0.0025
 #: how much a matte surface counts against one camera, for harmonics of each degree
 MATTE = (1e-3, 0.03, 0.1, 0.3)
 
@@ -82,13 +77,13 @@ def _by_training(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, fl
     shading of what they share. A light that is the same for all can't come near them, while
     harmonics with exposures do; where there is one light for all, shading comes as near.
     """
-    quick = settings.but(iterations=FIRST_STEPS, **QUICK)
+    quick = settings.but(iterations=settings.light_check_iterations, **QUICK)
     few, scores, errors = scene.reduced(settings.light_trial_factor), {}, {}
     for name, lit in LIGHTS:
         trainer = _tried(few, quick, lit)
         every = trainer.training_scores()[0] if trainer else np.zeros(1)
         scores[name], errors[name] = float(every.mean()), float((10 ** (-every / 20)).mean())
-    better = errors["camera"] <= errors["none"] + FIRST_MARGIN
+    better = errors["camera"] <= errors["none"] + settings.light_check_margin
     return ("camera" if better else "none"), _tried_figures(scores)
 
 

@@ -25,7 +25,6 @@ from stages.init.dental.surface.chart.hardware import (
     shows_hardware,
 )
 from stages.init.dental.surface.chart.jaws import (
-    OUTLINE_ERROR,
     PAST_EDGE,
     Chart,
     clearly_seen,
@@ -41,7 +40,7 @@ from stages.init.dental.surface.cover import uncovered
 from stages.init.dental.surface.ends import within_rows
 from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.measured import bend_to
-from stages.init.dental.surface.options import SurfaceOptions, SweepRound
+from stages.init.dental.surface.options import OUTLINE_ERROR, SurfaceOptions, SweepRound
 from stages.init.dental.surface.photos.photo import FullSize, Photo, at_full_size, prepare_photo
 from stages.init.dental.surface.photos.tissue import joined_to
 from stages.init.dental.surface.sweep import choose_pairs, sweep

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: Tissue is looked for this far around its outline (mm), for the cameras' errors.
+OUTLINE_ERROR = 0.5
+
 
 @dataclass(frozen=True)
 class SweepRound:
@@ -26,7 +29,7 @@ class SweepRound:
     window: float
     prior: float
     stiffness: float
-    inset: float = -0.5
+    inset: float = -OUTLINE_ERROR
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,6 @@ _ROW_SMOOTHING = 4.5
 _GUM_FADES = (0.5, 2.0)
 #: No tooth with the gum that goes with it is smaller (square mm; a lower incisor and 10 mm of gum).
 _TOOTH_AND_GUM = 100.0
-#: Tissue is looked for this far around its outline (mm), for the cameras' errors.
-OUTLINE_ERROR = 0.5
 
 
 @dataclass
@@ -230,5 +228,7 @@ def _scraps(mask: Mask, density: float) -> Mask:
 def _tissue_within(photo: Photo, jaw: Jaw, inset: float) -> Array32:
     """[h, w] float32: this jaw's teeth and gum less so many mm of their rim, or more."""
     tissue = np.maximum(photo.tooth_of(jaw), photo.gum_of(jaw))
+    if inset == 0:
+        return tissue
     change = cv2.erode if inset > 0 else cv2.dilate
     return np.asarray(change(tissue, disc(abs(inset) * photo.density)), np.float32)
