@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 def kernel(
     signature: str | None = None, *, parallel: bool = False, fastmath: bool = False,
-    nogil: bool = False,
+    nogil: bool = False, linked: bool = False,
 ) -> Any:  # fmt: skip
     """Decorator for a function that is called from Python: compiled at its first call, and kept.
 
@@ -33,6 +33,8 @@ def kernel(
             for each piece of work: what it contains is compiled twice, and by slower passes.
         fastmath: sums may be taken in any order.
         nogil: other threads of Python run meanwhile.
+        linked: other kernels call it too. What they need for that takes most of the time in which
+            a kernel is read from the disk; without it, they can't.
     """
     from pipeline.kernels.cache import KernelCache
 
@@ -40,7 +42,7 @@ def kernel(
 
     def decorate(function: Function) -> Any:
         compiled = _compiler(no_cfunc_wrapper=True, **options)(function)
-        compiled._cache = KernelCache(function, options)
+        compiled._cache = KernelCache(function, options | {"linked": linked})
         if signature is not None:
             compiled.compile(signature)
             compiled.disable_compile()

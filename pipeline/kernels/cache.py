@@ -15,6 +15,7 @@ from typing import Any
 import llvmlite
 import numba
 from filelock import FileLock, Timeout
+from llvmlite.binding import parse_assembly
 from numba.core import config
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
@@ -39,6 +40,7 @@ class KernelCache(_Cache):
     def __init__(self, function: Callable[..., Any], options: Mapping[str, bool]) -> None:
         self._function = function
         self._options = options
+        self._linked = options["linked"]
         self._name = f"{function.__module__}.{function.__qualname__}".replace("<locals>", "")
         self._enabled = True
         self._lock: FileLock | None = None
@@ -93,8 +95,9 @@ class KernelCache(_Cache):
                 and not data.library.has_dynamic_globals
             ):
                 name = self._file(sig, data.codegen)
+                parts = data._reduce()
                 with contextlib.suppress(OSError):
-                    _write(folder / name, dumps(data._reduce()))
+                    _write(folder / name, dumps(parts if self._linked else _unlinked(parts)))
                     places.tidy(folder, self._name)
         finally:
             self._go_on()
@@ -151,6 +154,17 @@ def _find(name: str, target_context: Any) -> Any:
         if checksum == hashlib.sha256(data).digest():
             return CompileResult._rebuild(target_context, *pickle.loads(data))
     return None
+
+
+def _unlinked(parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What a kernel is rebuilt from, with the name alone of what others would be linked with.
+
+    numba looks up what it calls from Python only if the bitcode defines it.
+    """
+    (name, kind, (machine_code, _)), description, *rest = parts
+    stub = f'define void @"{description.llvm_cpython_wrapper_name}"() {{ ret void }}'
+    bitcode = parse_assembly(stub).as_bitcode()
+    return (name, kind, (machine_code, bitcode)), description, *rest
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:

@@ -13,14 +13,16 @@ Other = TypeVar("Other")
 
 
 @contextmanager
-def one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV to one thread: its optical flow works in stripes, as many as there are threads,
-    and would change with their number.
+def opencv_threads(number: int) -> Iterator[None]:
+    """Let OpenCV use so many threads, until the end.
+
+    With one, its optical flow is the same on every machine: it works in stripes, as many as there
+    are threads.
     """
     import cv2
 
     before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(number)
     try:
         yield
     finally:

@@ -112,9 +112,9 @@ class FlowStage(Stage):
         return PARTS
 
     def run(self, context: StageContext) -> None:
-        from pipeline.kernels.threads import one_opencv_thread
+        from pipeline.kernels.threads import opencv_threads
 
-        with one_opencv_thread():
+        with opencv_threads(1):
             _run(context)
 
 

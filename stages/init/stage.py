@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,7 +172,7 @@ def _pointmap_options(config: InitConfig) -> PointmapOptions | None:
 
 def _from_features(context: StageContext, views: Views) -> None:
     """By features, or by teeth where these link photographs that features don't."""
-    from stages.init.densify import densify
+    from pipeline.kernels.threads import side_by_side
     from stages.init.dental.choice import ByTeeth, neither
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
@@ -182,7 +183,13 @@ def _from_features(context: StageContext, views: Views) -> None:
     by_teeth, options = ByTeeth(context, views), _classical_options(config)
     focals = with_focals(views.views, config.focal)
     told: list[str] = []
-    if free and by_teeth.is_first(focals, options):
+    # what either way needs is loaded meanwhile
+    densify, teeth_first = side_by_side(
+        lambda: import_module("stages.init.densify").densify,
+        lambda: free and by_teeth.is_first(focals, options),
+        context.threads,
+    )
+    if teeth_first:
         context.progress("features do not link the photographs; trying the teeth", 0, 1)
         with suppress(ReconstructionError):
             by_teeth.place()

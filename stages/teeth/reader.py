@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
+from itertools import compress
 from typing import Any, TypeVar
 
 import numpy as np
 
 from pipeline.artifacts.views import View
-from pipeline.kernels.threads import one_opencv_thread
+from pipeline.kernels.threads import opencv_threads
 from stages.teeth.read import (
     Glances,
     Reading,
@@ -49,7 +51,7 @@ class PhotographReader:
 
     def __init__(self, views: Sequence[View], threads: int) -> None:
         self._views = views
-        self._threads = max(1, min(threads, len(views)))
+        self._threads = max(1, threads)
         self._glances = [Glances(view.image, view.valid()) for view in views]
 
     def shows_teeth(self) -> bool:
@@ -65,18 +67,27 @@ class PhotographReader:
         taken from behind the patient's head, together; the outlines remain those of the
         photographs.
         """
+        numbers = range(len(self._views))
+        progress("reading teeth", 0, len(numbers))
         with self._side_by_side() as map_:
-            readings = []
-            progress("reading teeth", 0, len(self._views))
-            for reading in map_(self._read, self._numbers()):
-                readings.append(reading)
-                progress("reading teeth", len(readings), len(self._views))
-            if self._upside_down(map_):
-                readings = list(map_(lambda k: self._read(k, quarters=2), self._numbers()))
+            first = map_(lambda glances: glances.turned(0)[1], self._glances)
+            both = [shows_both_rows(crowns) for crowns in first]
+            asked = evenly([*compress(self._glances, both)], _TURNED)
+            # what a photograph looks like on its head is seen while others are read
+            tasks = [
+                *(partial(self._read, number) for number in numbers),
+                *(partial(_gain_upside_down, glances) for glances in asked),
+            ]
+            readings, gains = [], []
+            for done, result in enumerate(map_(lambda task: task(), tasks), 1):
+                if isinstance(result, Reading):
+                    readings.append(result)
+                    progress("reading teeth", done, len(numbers))
+                elif result is not None:
+                    gains.append(result)
+            if gains and float(np.mean(gains)) > _MORE_UPRIGHT:
+                readings = list(map_(partial(self._read, quarters=2), numbers))
         return readings
-
-    def _numbers(self) -> Iterable[int]:
-        return range(len(self._views))
 
     def _read(self, number: int, quarters: int = 0) -> Reading:
         view = self._views[number]
@@ -84,18 +95,22 @@ class PhotographReader:
             view.image, view.valid(), view.name, quarters=quarters, glances=self._glances[number]
         )
 
-    def _upside_down(self, map_: Map) -> bool:
-        """Do the photographs stand on their heads, by some that show both rows of teeth?"""
-        upright = [g for g in self._glances if shows_both_rows(g.turned(0)[1])]
-        found = map_(_gain_upside_down, evenly(upright, _TURNED))
-        gains = [gain for gain in found if gain is not None]
-        return bool(gains) and float(np.mean(gains)) > _MORE_UPRIGHT
-
     @contextmanager
     def _side_by_side(self) -> Iterator[Map]:
-        """Map over photographs in threads, OpenCV keeping to one in each."""
-        with one_opencv_thread(), ThreadPoolExecutor(self._threads) as pool:
-            yield pool.map
+        """Map over photographs in threads, OpenCV keeping to one in each; one that would be left
+        over for the end has all of them to itself.
+        """
+        with ThreadPoolExecutor(self._threads) as pool:
+
+            def map_(function: Callable[..., Any], items: Iterable[Any]) -> Iterator[Any]:
+                every = list(items)
+                alone = len(every) - int(len(every) % self._threads == 1)
+                with opencv_threads(1):
+                    yield from pool.map(function, every[:alone])
+                with opencv_threads(self._threads):
+                    yield from pool.map(function, every[alone:])
+
+            yield map_
 
 
 def read_photographs(views: Sequence[View], threads: int, progress: Progress) -> list[Reading]:

@@ -13,10 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from pipeline.kernels import cache, folder, kernel, kernel_threads, news, rehearsals
 from pipeline.kernels import each as each_piece
-from pipeline.kernels.threads import in_threads, one_opencv_thread, side_by_side
+from pipeline.kernels.threads import in_threads, opencv_threads, side_by_side
 from pipeline.stage import get_stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,6 +89,30 @@ with news.told_to(compiled.append):
         raise AssertionError
 print(len(compiled), "numba.typed.typeddict" in sys.modules)
 """
+#: A kernel that calls another, which is kept already; both with types said ahead.
+LINKED = """
+from pipeline.kernels import kernel
+
+@kernel("float64(float64)", linked=True)
+def squared(value):
+    return value * value
+"""
+CALLER = """
+from pipeline.kernels import kernel
+from sums.linked import squared
+
+@kernel("float64(float64)")
+def and_one(value):
+    return squared(value) + 1
+"""
+RUN_LINKED = """
+from pipeline.kernels import news
+
+compiled = []
+with news.told_to(compiled.append):
+    from sums.caller import and_one, squared
+print(squared(3.0), and_one(3.0), len(compiled))
+"""
 
 
 @pytest.fixture
@@ -117,6 +142,14 @@ def run(package: Path) -> tuple[float, int]:
     return float(value), int(compiled)
 
 
+def is_compiled(value: object) -> bool:
+    return isinstance(value, Dispatcher)
+
+
+def is_kernel(value: object) -> bool:
+    return is_compiled(value) and isinstance(value._cache, cache.KernelCache)
+
+
 def kept(package: Path) -> list[str]:
     return sorted(p.name for p in (package.parent / "cache" / "dentalsplat").iterdir())
 
@@ -138,6 +171,27 @@ class TestSource:
             process = started(sums, RUN_MORE)
             assert process.communicate(timeout=120)[0].strip() == said
             assert process.returncode == 0
+
+    def test_a_linked_one_is_called_by_others_also_when_it_was_kept(self, sums):
+        (sums / "linked.py").write_text(LINKED)
+        for number, compiled in ((1, 2), (2, 1), (2, 0)):
+            (sums / "caller.py").write_text(CALLER.replace("+ 1", f"+ {number}"))
+            process = started(sums, RUN_LINKED)
+            said = process.communicate(timeout=120)[0].split()
+            assert said == ["9.0", f"{9.0 + number}", str(compiled)]
+
+    def test_what_kernels_call_is_linked(self):
+        """Or a helper: what is kept of other kernels can't be linked with."""
+        files = [path for home in ("pipeline", "stages") for path in (ROOT / home).rglob("*.py")]
+        found = []
+        for file in (path for path in files if "\n@kernel" in path.read_text()):
+            module = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+            known = vars(importlib.import_module(module))
+            for caller in filter(is_compiled, known.values()):
+                code, names = caller.py_func.__code__, caller.py_func.__globals__
+                found += [names[name] for name in code.co_names if is_kernel(names.get(name))]
+        assert found
+        assert all(called._cache._linked for called in found)
 
     def test_an_edited_helper_counts_and_old_states_are_deleted(self, sums):
         edits = [("10", "10"), ("2 * value", "3 * value")]
@@ -261,10 +315,10 @@ def test_opencv_has_its_threads_back_whatever_happened():
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)
     try:
-        with one_opencv_thread():
+        with opencv_threads(1):
             assert cv2.getNumThreads() == 1
         assert cv2.getNumThreads() == 3
-        with pytest.raises(KeyError), one_opencv_thread():
+        with pytest.raises(KeyError), opencv_threads(1):
             raise KeyError
         assert cv2.getNumThreads() == 3
     finally:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.kernels.threads import one_opencv_thread
+from pipeline.kernels.threads import opencv_threads
 from pipeline.studies.register import solving
 from pipeline.studies.register.estimate import (
     CLEAR,
@@ -48,7 +48,7 @@ def both_ways(
         first_from_second: [4, 4] similarity to begin with.
         agreeing: teeth that seem to have stood still, by that similarity.
     """
-    with one_opencv_thread():
+    with opencv_threads(1):
         there = started(first, second, first_from_second, agreeing)
         back = started(second, first, inverted(first_from_second), agreeing)
         there, back = agreed(there, back)

@@ -10,6 +10,7 @@ from pipeline.kernels import kernel
 @kernel(
     "void(float64[::1], float64[:,::1], float64[:,::1])",
     nogil=True,
+    linked=True,
 )
 def rotation_and_jacobian(w, rotation, jacobian):  # type: ignore[no-untyped-def]
     """exp([w]x) and its left Jacobian: exp([w + d]x) = exp([jacobian d]x) exp([w]x)."""
@@ -43,7 +44,7 @@ def rotation_and_jacobian(w, rotation, jacobian):  # type: ignore[no-untyped-def
     jacobian[2, 1] += c * x
 
 
-@kernel("void(float64[::1], float64[:,::1])", nogil=True)
+@kernel("void(float64[::1], float64[:,::1])", nogil=True, linked=True)
 def cross_matrix(t, out):  # type: ignore[no-untyped-def]
     """[t]x: cross_matrix @ v = t x v."""
     out[0, 0] = out[1, 1] = out[2, 2] = 0.0
@@ -51,7 +52,7 @@ def cross_matrix(t, out):  # type: ignore[no-untyped-def]
     out[1, 0], out[2, 0], out[2, 1] = t[2], -t[1], t[0]
 
 
-@kernel("float64(float64[:,::1], float64[:,::1])", nogil=True)
+@kernel("float64(float64[:,::1], float64[:,::1])", nogil=True, linked=True)
 def cholesky(A, L):  # type: ignore[no-untyped-def]
     """Lower factor of A into L; returns log det A, or nan where A is not positive definite."""
     n = len(A)
@@ -71,7 +72,7 @@ def cholesky(A, L):  # type: ignore[no-untyped-def]
     return log_determinant
 
 
-@kernel("void(float64[:,::1], float64[::1], float64[::1])", nogil=True)
+@kernel("void(float64[:,::1], float64[::1], float64[::1])", nogil=True, linked=True)
 def solve_cholesky(L, b, out):  # type: ignore[no-untyped-def]
     """Solve L Lt out = b."""
     n = len(b)
@@ -91,6 +92,7 @@ def solve_cholesky(L, b, out):  # type: ignore[no-untyped-def]
     "float64(float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1],"
     " float64, float64[:,::1], float64[::1], float64[:,:,::1])",
     nogil=True,
+    linked=True,
 )
 def eliminate(H, b, H_own, b_own, H_cross, damping, S, s, own_inverse):  # type: ignore[no-untyped-def]
     """Schur complement over the landmarks; returns their part of the log determinant.

@@ -89,6 +89,7 @@ def nearest_similarity(
     "void(float64[:,::1], float64[::1], float64, float64[:,:,::1], float64[:,::1],"
     " float64[:,:,::1], float64[:,::1], float64, float64[::1])",
     nogil=True,
+    linked=True,
 )
 def unknowns_of(  # type: ignore[no-untyped-def]
     rotation, centre, log_scale, turns, shifts, nominal, angle_deviations, distance, x
@@ -115,6 +116,7 @@ def unknowns_of(  # type: ignore[no-untyped-def]
     "void(float64, float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1],"
     " float64[:,::1])",
     nogil=True,
+    linked=True,
 )
 def tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
     """T [7V + 9, 16]: how the views' unknowns and the arch's follow similarity and arch."""

@@ -27,6 +27,7 @@ CENTRE_Z = -16.0
     "void(float64[::1], int64, float64[:,:,::1], float64[:,::1], float64, float64[::1],"
     " float64[::1], float64[:,:,::1], float64[:,::1], float64[::1], float64[:,:,::1])",
     nogil=True,
+    linked=True,
 )
 def place_cameras(  # type: ignore[no-untyped-def]
     x, views, nominal, angle_deviations, distance, focals, focal_deviations,
@@ -57,6 +58,7 @@ def place_cameras(  # type: ignore[no-untyped-def]
     " float64[::1], float64[:,:,::1], float64[:,::1], float64[::1], boolean,"
     " float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1])",
     nogil=True,
+    linked=True,
 )
 def add_landmarks(  # type: ignore[no-untyped-def]
     x, offsets, views, view_of, landmark_of, pixels, deviations, template, lower, offset_deviation,
@@ -152,6 +154,7 @@ def add_landmarks(  # type: ignore[no-untyped-def]
     " float64[:,:,::1], float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1],"
     " float64[::1], boolean, float64[:,::1], float64[::1])",
     nogil=True,
+    linked=True,
 )
 def add_matches(  # type: ignore[no-untyped-def]
     pairs, starts, matches, pair_weights, pair_deviations,
@@ -256,6 +259,7 @@ def add_matches(  # type: ignore[no-untyped-def]
     "float64(float64[::1], float64[:,::1], int64, float64, float64, float64, float64[:,::1],"
     " boolean, float64[:,::1], float64[::1], float64[:,:,::1], float64[:,::1])",
     nogil=True,
+    linked=True,
 )
 def add_priors(  # type: ignore[no-untyped-def]
     x, offsets, views, distance, distance_deviation, own_deviation, centres, derive, H, b,

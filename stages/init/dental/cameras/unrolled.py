@@ -15,7 +15,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import is_upper
-from pipeline.kernels.threads import one_opencv_thread
+from pipeline.kernels.threads import opencv_threads
 from stages.init.dental.cameras.bundle import Adjusted, Matches, view_angles
 from stages.init.dental.template import GUM_STEPS, landmark_names
 
@@ -313,7 +313,7 @@ def dense_matches(
     weights: list[float] = []
     deviations: list[float] = []
     figures: dict[tuple[int, int], PairFigures] = {}
-    with one_opencv_thread():
+    with opencv_threads(1):
         found = [flow_matches(charts[i], charts[j], scale) for i, j in pairs]
     for (i, j), (pixels, share) in zip(pairs, found, strict=True):
         band = (photos[i].band + photos[j].band) / 2
