@@ -15,8 +15,8 @@ from pathlib import Path
 #: compiled for so many states of the sources a kernel is kept: for going back and forth
 KEPT = 3
 SUFFIX = ".kernel"
-#: `from MODULE import NAMES` and `import MODULES` at the left margin, as what a function imports may
-#: be there or not. A parser takes seventeen times as long.
+#: `from MODULE import NAMES` and `import MODULES` at the left margin: what functions import may
+#: not be there. A parser takes seventeen times as long.
 _IMPORT = re.compile(
     r"^(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))", re.MULTILINE
 )
