@@ -195,8 +195,8 @@ def _sweep_view(
             options.min_variance, ranges, buffers[0],
         )  # fmt: skip
         penalty = edge_aware_penalty(own.gray, options.p2)
-        total = aggregate(volume, penalty, options.p1, ranges, buffers[1])
-        plane, ncc, _ = decide(total, volume, ranges)
+        total = aggregate(volume, penalty, options.p1, buffers[1])
+        plane, ncc, _ = decide(total, volume)
         if level:
             finer = pyramids[index][level - 1].gray.shape
             found = plane / np.float32(number - 1)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.kernels import each, helper, kernel
-from stages.stereo.tiles import TILE, Buffer, full_ranges, tile_grid
+from stages.stereo.tiles import TILE, Buffer, Volume, full_ranges, tile_grid
 
 Array = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
@@ -131,10 +131,22 @@ def _window_sums(values, window, stride, length, rows, out):  # type: ignore[no-
 
 @kernel(fastmath=True, nogil=True)
 def _sweep_tile(  # type: ignore[no-untyped-def]
-    tile, across, reference, weight, sources, sizes, homographies, ranges, radius, var_min, volume
+    tile,
+    across,
+    reference,
+    weight,
+    sources,
+    sizes,
+    homographies,
+    radius,
+    var_min,
+    starts,
+    ranges,
+    costs,
 ):
     """Fill a tile of the cost volume, at the planes of its range."""
     height, width = reference.shape
+    first, planes = ranges[tile, 0], ranges[tile, 1] - ranges[tile, 0]
     y0 = tile // across * _ROWS
     x0 = tile % across * _COLUMNS
     window = 2 * radius + 1
@@ -177,7 +189,7 @@ def _sweep_tile(  # type: ignore[no-untyped-def]
     for q in range(3):
         _window_sums(values[q], window, stride, length, rows, own[q])
     enough = half * np.float32(window * window)
-    for d in range(ranges[tile, 0], ranges[tile, 1]):
+    for d in range(first, first + planes):
         for k in range(length):
             best[k] = _UNSEEN
             next_best[k] = _UNSEEN
@@ -227,9 +239,10 @@ def _sweep_tile(  # type: ignore[no-untyped-def]
         for k in range(length):
             cost = half * (best[k] + next_best[k]) if seen[k] >= np.float32(3) else best[k]
             best[k] = cost if seen[k] > zero else NEUTRAL_COST
-        for y in range(y0, min(y0 + _ROWS, height)):
-            for x in range(x0, min(x0 + _COLUMNS, width)):
-                volume[y, x, d] = best[(y - y0) * stride + x - x0]
+        at = starts[tile] + d - first
+        for y in range(min(_ROWS, height - y0)):
+            for x in range(min(_COLUMNS, width - x0)):
+                costs[at + (y * _COLUMNS + x) * planes] = best[y * stride + x]
 
 
 def cost_volume(
@@ -242,7 +255,7 @@ def cost_volume(
     var_min: float = 2e-5,
     ranges: Integers | None = None,
     buffer: Buffer | None = None,
-) -> Array:
+) -> Volume:
     """Matching cost of every pixel at every plane: 1 - ZNCC, averaged over the best sources.
 
     The best two count, or of less than three that see the pixel the best. Only pixels that are
@@ -258,19 +271,20 @@ def cost_volume(
         window: side of the window in pixels, odd.
         var_min: least variance in the denominator, so that noise does not correlate.
         ranges: [T, 2] int64 for every tile (row by row) its first plane and the one after its
-            last; None: all planes. Outside of them the volume holds anything.
+            last; None: all planes.
         buffer: where the volume goes; None: into memory of its own.
 
     Returns:
-        [H, W, D] float32 in 0..1.2; `NEUTRAL_COST` where no source can be compared.
+        Costs in 0..1.2; `NEUTRAL_COST` where no source can be compared.
     """
     height, width = reference.shape
-    volume = (buffer or Buffer()).of((height, width, len(homographies)))
-    down, across = tile_grid(reference.shape)
+    shape = height, width, len(homographies)
+    down, across = tile_grid((height, width))
+    ranges = full_ranges((height, width), len(homographies)) if ranges is None else ranges
+    volume = Volume.over(ranges, shape, buffer)
     each(
         _sweep_tile, down * across, across, np.ascontiguousarray(reference, np.float32),
-        usable.astype(np.float32), sources, sizes, homographies,
-        full_ranges(reference.shape, len(homographies)) if ranges is None else ranges,
-        int(window) // 2, np.float32(var_min), volume,
+        usable.astype(np.float32), sources, sizes, homographies, int(window) // 2,
+        np.float32(var_min), volume.starts, volume.ranges, volume.values,
     )  # fmt: skip
     return volume

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -27,12 +29,58 @@ class Buffer:
     def __init__(self) -> None:
         self._values = np.empty(0, np.float32)
 
-    def of(self, shape: tuple[int, ...]) -> Array:
-        """An array of this shape, float32, that holds anything; it ends the one before."""
-        size = int(np.prod(shape))
-        if size > len(self._values):
-            self._values = np.empty(size, np.float32)
-        return self._values[:size].reshape(shape)
+    def of(self, size: int) -> Array:
+        """[size] float32 that hold anything; they end those before."""
+        if size > len(self._values):  # room that is not used takes no pages
+            self._values = np.empty(2 * size, np.float32)
+        return self._values[:size]
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A number for every pixel at every plane of its tile's range.
+
+    Attributes:
+        values: [M] float32: tile after tile, in each the pixels of `TILE` row by row (of tiles
+            that the image cuts as well), each with all planes of the tile's range.
+        starts: [T] int64, where each tile's values begin.
+        ranges: [T, 2] int64 for every tile, row by row, its first plane and the one after its last.
+        shape: (H, W, D).
+        tile: rows and columns of a tile.
+    """
+
+    values: Array
+    starts: Integers
+    ranges: Integers
+    shape: tuple[int, int, int]
+    tile: tuple[int, int] = TILE
+
+    @classmethod
+    def over(
+        cls, ranges: Integers, shape: tuple[int, int, int], buffer: Buffer | None = None
+    ) -> Volume:
+        """One that holds anything: in a buffer, or in memory of its own."""
+        sizes = TILE[0] * TILE[1] * (ranges[:, 1] - ranges[:, 0])
+        ends = np.cumsum(sizes)
+        return cls((buffer or Buffer()).of(int(ends[-1])), ends - sizes, ranges, shape)
+
+    @classmethod
+    def of(cls, whole: Array) -> Volume:
+        """A volume [H, W, D] float32 with all of its planes: one tile."""
+        height, width, planes = whole.shape
+        starts, ranges = np.zeros(1, np.int64), np.array([[0, planes]], np.int64)
+        return cls(
+            np.ascontiguousarray(whole).ravel(), starts, ranges, whole.shape, (height, width)
+        )
+
+    def like(self, buffer: Buffer | None = None) -> Volume:
+        """Another of the same pixels and planes, that holds anything."""
+        return replace(self, values=(buffer or Buffer()).of(len(self.values)))
+
+    @property
+    def layout(self) -> tuple[Integers, Integers, tuple[int, int], tuple[int, int, int]]:
+        """What kernels need beside the values to find their way."""
+        return self.starts, self.ranges, self.tile, self.shape
 
 
 def tile_grid(shape: tuple[int, int]) -> tuple[int, int]:

@@ -10,13 +10,14 @@ import pytest
 
 from pipeline.artifacts.confidence import COMPLETED
 from stages.stereo import DenseOptions, DenseView, dense_depths
+from stages.stereo.aggregate import aggregate, decide
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.fill import continued
 from stages.stereo.polish import polish, source_maps
 from stages.stereo.sgbm import sgbm_depth
 from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
 from stages.stereo.sweep import cost_volume, stack_sources
-from stages.stereo.tiles import TILE, full_ranges, ranges_around, tile_grid
+from stages.stereo.tiles import TILE, Volume, full_ranges, ranges_around, tile_grid
 from tests.stages.dense_scene import camera, render, scene
 
 # On so small an image depth changes four times as fast from pixel to pixel: smaller penalties.
@@ -375,8 +376,29 @@ def test_costs_inside_a_range_are_those_of_the_full_sweep():
     some = cost_volume(
         gray, np.ones_like(usable), stack, sizes, homographies, 5, ranges=part
     )  # fmt: skip
-    np.testing.assert_array_equal(some[:, :, 1:4], whole[:, :, 1:4])
-    assert (whole.argmin(2) == 2).mean() > 0.7
+    np.testing.assert_array_equal(unpacked(some)[:, :, 1:4], unpacked(whole)[:, :, 1:4])
+    assert np.isnan(unpacked(some)[:, :, [0, 4, 5]]).all()
+    assert (unpacked(whole).argmin(2) == 2).mean() > 0.7
+    even = np.ones_like(gray)
+    by_tiles = aggregate(whole, even, 0.1)
+    at_once = aggregate(Volume.of(unpacked(whole)), even, 0.1)
+    np.testing.assert_array_equal(unpacked(by_tiles), at_once.values.reshape(whole.shape))
+    for found, wanted in zip(
+        decide(by_tiles, whole), decide(at_once, Volume.of(unpacked(whole))), strict=True
+    ):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def unpacked(volume: Volume) -> np.ndarray:
+    """[H, W, D], not a number beyond the ranges."""
+    whole = np.full(volume.shape, np.nan, np.float32)
+    across = tile_grid(volume.shape[:2])[1]
+    for tile, (low, high) in enumerate(volume.ranges):
+        y, x = tile // across * TILE[0], tile % across * TILE[1]
+        part = whole[y : y + TILE[0], x : x + TILE[1], low:high]
+        values = volume.values[volume.starts[tile] :][: TILE[0] * TILE[1] * (high - low)]
+        part[:] = values.reshape(*TILE, high - low)[: part.shape[0], : part.shape[1]]
+    return whole
 
 
 def test_a_guess_goes_on_from_what_is_known_beside_it():

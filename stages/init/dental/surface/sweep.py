@@ -22,6 +22,7 @@ from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photos.photo import Photo
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
+from stages.stereo.tiles import Volume
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
@@ -257,8 +258,9 @@ def match(
     volume = matching_cost(points, normals, offsets, photos, seen, pairs, half)
     prior = settings.prior * np.minimum((offsets / 2) ** 2, _MOST_PRIOR)
     penalty = edge_aware_penalty(_reference(photos, points, seen), options.sgm_p2, _EDGE_FALLOFF)
-    total = aggregate(volume + prior.astype(np.float32), penalty, options.sgm_p1)
-    plane, correlation, _ = decide(total, volume)
+    likely = Volume.of(volume + prior.astype(np.float32))
+    total = aggregate(likely, penalty, options.sgm_p1)
+    plane, correlation, _ = decide(total, Volume.of(volume))
     offset = offsets[0] + settings.step * plane
     both = np.zeros(radius.shape, bool)
     for a, b in pairs:
