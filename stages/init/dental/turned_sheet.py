@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -70,7 +71,7 @@ def render_turned(
     depth = np.zeros((h, w))
     image = np.full((h, w, 3), _BACKGROUND)
     _paint(pixels, local[:, 2].copy(), colours, surface.faces, depth, image)
-    small = image.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3).mean(axis=(1, 3))
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(small * 255), 0, 255).astype(np.uint8)
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import is_upper
-from pipeline.kernels.threads import opencv_threads
+from pipeline.kernels.threads import in_threads, opencv_threads
 from stages.init.dental.cameras.bundle import Adjusted, Matches, view_angles
 from stages.init.dental.template import GUM_STEPS, landmark_names
 
@@ -185,11 +185,14 @@ def _thin_plate(sites: Array, values: Array, queries: Array) -> Array:
     )
 
 
-def unroll(surface: Array, adjusted: Adjusted, view: int, photo: Photo, scale: float) -> Unrolled:
+def unroll(
+    surface: Array, normal: Array, adjusted: Adjusted, view: int, photo: Photo, scale: float
+) -> Unrolled:
     """One photograph unrolled onto the chart.
 
     Args:
         surface: [h, w, 3] of `chart_surface`.
+        normal: [h, w, 3] of the surface.
         adjusted: the cameras.
         view: which of them.
         photo: the photograph.
@@ -197,8 +200,6 @@ def unroll(surface: Array, adjusted: Adjusted, view: int, photo: Photo, scale: f
     """
     height, width = photo.grey.shape
     rotation, translation = adjusted.rotations[view], adjusted.translations[view]
-    normal = np.cross(np.gradient(surface, axis=0), np.gradient(surface, axis=1))
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-9
     to_camera = -rotation.T @ translation - surface
     to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
     facing = (normal * to_camera).sum(-1)
@@ -295,6 +296,7 @@ def dense_matches(
     pairs: list[tuple[int, int]],
     scale: float,
     total_weight: float,
+    threads: int = 1,
 ) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
     """Dense matches of pairs of photographs, and how well each pair agrees.
 
@@ -304,17 +306,26 @@ def dense_matches(
         pairs: which to match.
         scale: pixels per mm of the chart.
         total_weight: of all matches of a pair.
+        threads: number of threads; changes nothing but the time.
     """
     surface = chart_surface(adjusted.points, scale)
+    normal = np.cross(np.gradient(surface, axis=0), np.gradient(surface, axis=1))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-9
     views = sorted({view for pair in pairs for view in pair})
-    charts = {view: unroll(surface, adjusted, view, photos[view], scale) for view in views}
     kept: list[Array] = []
     used: list[tuple[int, int]] = []
     weights: list[float] = []
     deviations: list[float] = []
     figures: dict[tuple[int, int], PairFigures] = {}
     with opencv_threads(1):
-        found = [flow_matches(charts[i], charts[j], scale) for i, j in pairs]
+        unrolled = in_threads(
+            lambda view: unroll(surface, normal, adjusted, view, photos[view], scale),
+            views, threads,
+        )  # fmt: skip
+        charts = dict(zip(views, unrolled, strict=True))
+        found = in_threads(
+            lambda pair: flow_matches(charts[pair[0]], charts[pair[1]], scale), pairs, threads
+        )
     for (i, j), (pixels, share) in zip(pairs, found, strict=True):
         band = (photos[i].band + photos[j].band) / 2
         error = np.nan
@@ -338,7 +349,7 @@ def dense_matches(
 
 
 def match_neighbours(
-    adjusted: Adjusted, photos: list[Photo], scale: float, total_weight: float
+    adjusted: Adjusted, photos: list[Photo], scale: float, total_weight: float, threads: int = 1
 ) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
     """`dense_matches` of neighbouring photographs, and of those but one apart that are near."""
     yaws = view_angles(adjusted)[:, 0]
@@ -349,4 +360,4 @@ def match_neighbours(
         for a, b in zip(order[:-2], order[2:], strict=True)
         if yaws[b] - yaws[a] < MATCHED_YAW
     }
-    return dense_matches(adjusted, photos, sorted(wanted), scale, total_weight)
+    return dense_matches(adjusted, photos, sorted(wanted), scale, total_weight, threads)

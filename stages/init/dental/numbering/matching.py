@@ -90,8 +90,9 @@ class Matching:
     def _matched(self, scored: Scored) -> tuple[Matches, dict[tuple[int, int], PairFigures]]:
         options = self._options
         return match_neighbours(
-            scored.adjusted, self._photos, options.chart_scale, options.dense_weight
-        )
+            scored.adjusted, self._photos, options.chart_scale, options.dense_weight,
+            self._scorer.threads,
+        )  # fmt: skip
 
     def _as_cameras(self, scored: Scored) -> Scored:
         """Solved for its cameras rather than to compare it with others."""
