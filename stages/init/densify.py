@@ -27,7 +27,7 @@ from stages.init.config import InitConfig
 from stages.init.dental.place_known import as_seen, held_teeth, world_from_arch
 from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import PlacedTeeth
-from stages.init.dental.surface.dense import completed_surface
+from stages.init.dental.surface.dense import StartedSurface, completed_surface, started_surface
 from stages.init.placement import Placement
 from stages.init.write import save_all, save_matches
 from stages.stereo import DenseOptions, DenseView, dense_depths
@@ -142,17 +142,21 @@ def completed_by_teeth(
     """
     held = held_teeth(context, views, cameras)
 
-    def numbered() -> PlacedTeeth | None:
+    def shaped() -> tuple[PlacedTeeth, StartedSurface] | None:
         # A wrong number does no harm here: the crowns have to lie where the depth is.
         try:
-            return held.placed(context, views, cameras, accept_doubtful=True, quickly=True)
+            teeth = held.placed(context, views, cameras, accept_doubtful=True, quickly=True)
         except (ReconstructionError, RequestError):
             return None
+        small = teeth.small
+        images, valid = [v.image for v in small.views], [v.valid() for v in small.views]
+        start = started_surface(images, valid, small.dentitions, small.fit, held.surface, 1)
+        return teeth, start
 
-    # Numbers are worked out by hardly more than one thread.
-    dense, teeth = side_by_side(stereo, numbered, context.threads)
-    if teeth is None:
+    dense, shapes = side_by_side(stereo, shaped, context.threads)
+    if shapes is None:
         return dense, False
+    teeth, start = shapes
     scale, turn, _ = world_from_arch(teeth.fit, cameras)
     sizes = [(view.width, view.height) for view in teeth.small.views]
     measured = [
@@ -161,12 +165,7 @@ def completed_by_teeth(
         for found, there, size in zip(dense, held.centred, sizes, strict=True)
     ]
     try:
-        surface = completed_surface(
-            [view.image for view in teeth.small.views],
-            [view.valid() for view in teeth.small.views],
-            teeth.small.dentitions, teeth.small.fit, measured, held.surface, context.threads,
-            teeth.full,
-        )  # fmt: skip
+        surface = completed_surface(start, measured, context.threads, teeth.full)
     except ReconstructionError:
         return dense, False
     seen = as_seen(surface, held.centred, views.views, scale, turn)

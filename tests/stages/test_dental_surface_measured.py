@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ReconstructionError
-from stages.init.dental.surface.dense import completed_surface, dense_surface
+from stages.init.dental.surface.dense import completed_surface, dense_surface, started_surface
 from stages.init.dental.surface.options import SurfaceOptions
 from tests.stages.dental_arch_scene import scene
 
@@ -43,10 +43,15 @@ def errors(views, where) -> np.ndarray:  # type: ignore[no-untyped-def]
     return np.concatenate(parts)
 
 
+def completed(depths, threads: int, options=OPTIONS):  # type: ignore[no-untyped-def]
+    """The crown shapes, bent to these depths, as each photograph sees them."""
+    return completed_surface(started_surface(*inputs()[:4], options, threads), depths, threads, ())
+
+
 def test_crowns_are_bent_to_what_is_measured_and_better_beyond_it() -> None:
     depths = measured()
     shapes = dense_surface(*inputs()[:4], options=OPTIONS, threads=2).views
-    bent = completed_surface(*inputs()[:4], depths, OPTIONS, 2, ())
+    bent = completed(depths, 2)
     there, beyond = [part > 0 for part in depths], [part == 0 for part in depths]
     assert np.median(errors(bent, there)) < 0.5 * np.median(errors(shapes, there))
     assert np.median(errors(bent, beyond)) < np.median(errors(shapes, beyond))
@@ -57,9 +62,7 @@ def test_crowns_are_bent_to_what_is_measured_and_better_beyond_it() -> None:
 
 def test_what_is_measured_is_surer_than_what_goes_on_from_it() -> None:
     depths = measured(wide=0.3)
-    for view, part in zip(
-        completed_surface(*inputs()[:4], depths, OPTIONS, 1, ()), depths, strict=True
-    ):
+    for view, part in zip(completed(depths, 1), depths, strict=True):
         assert view is not None
         shown = view.depth > 0
         assert np.median(view.confidence[shown & (part > 0)]) > 3
@@ -68,11 +71,11 @@ def test_what_is_measured_is_surer_than_what_goes_on_from_it() -> None:
 
 def test_some_wrong_depth_does_not_bend_the_crowns() -> None:
     depths = measured(wide=1.0)
-    right = completed_surface(*inputs()[:4], depths, OPTIONS, 1, ())
+    right = completed(depths, 1)
     rng = np.random.default_rng(0)
     for part in depths:
         part[(rng.random(part.shape) < 0.1) & (part > 0)] += 4
-    wrong = completed_surface(*inputs()[:4], depths, OPTIONS, 1, ())
+    wrong = completed(depths, 1)
     everywhere = [part > 0 for part in depths]
     assert np.median(errors(wrong, everywhere)) < np.median(errors(right, everywhere)) + 0.15
 
@@ -80,13 +83,13 @@ def test_some_wrong_depth_does_not_bend_the_crowns() -> None:
 @pytest.mark.parametrize("off", [-4.0, 4.0])
 def test_depth_that_is_not_of_the_crowns_is_refused(off: float) -> None:
     with pytest.raises(ReconstructionError, match=r"crowns would lie -?[34]\.\d mm from"):
-        completed_surface(*inputs()[:4], measured(off, 1.0), OPTIONS, 1, ())
+        completed(measured(off, 1.0), 1)
 
 
 def test_nothing_measured_leaves_the_crown_shapes() -> None:
     nothing = [np.zeros_like(part) for part in measured()]
     shapes = dense_surface(*inputs()[:4], options=replace(OPTIONS, carve=False), threads=1).views
-    same = completed_surface(*inputs()[:4], nothing, replace(OPTIONS, carve=False), 1, ())
+    same = completed(nothing, 1, replace(OPTIONS, carve=False))
     for a, b in zip(same, shapes, strict=True):
         assert a is not None
         assert b is not None

@@ -78,11 +78,12 @@ def ball_before_the_cameras(monkeypatch):
         })  # fmt: skip
         return PlacedTeeth(views, found.dentitions, found.fit, small, [])
 
-    def surface(images, valid, dentitions, fit, depths, *_):
+    def surface(start, depths, *_):
         asked["depths"] = depths
         return found.surface.views
 
     monkeypatch.setattr("stages.init.dental.place_known.place_teeth", place)
+    monkeypatch.setattr(densify, "started_surface", lambda *_: None)
     monkeypatch.setattr(densify, "completed_surface", surface)
     return found, asked
 

@@ -140,7 +140,7 @@ class HeldTeeth:
 
         Args:
             quickly: without matching photographs on the arch, which speaks for or against numbers
-                and cameras, and in silence.
+                and cameras, in silence, and on this thread alone.
 
         Raises:
             ReconstructionError: no teeth, or they are doubtful, or don't fit the cameras.
@@ -152,7 +152,8 @@ class HeldTeeth:
         teeth = place_teeth(
             [found.view for found in self.centred], self.names, self.dentitions,
             [found.focal for found in self.centred], options,
-            accept_doubtful=accept_doubtful, threads=context.threads, progress=progress,
+            accept_doubtful=accept_doubtful, threads=1 if quickly else context.threads,
+            progress=progress,
             cameras=[camera.cam_from_world for camera in cameras],
             scales=[working_scale(view.width, view.height) for view in views.views],
         )  # fmt: skip

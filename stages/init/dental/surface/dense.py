@@ -121,12 +121,12 @@ def dense_surface(
         ValueError: lists of different length, sizes that don't agree, or no placed photograph.
     """
     options = options or SurfaceOptions()
-    _check_lengths(images, valid, dentitions, fit)
     steps = 3 + len(options.rounds)
     with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
         progress("photographs", 0, steps)
-        photos, charts, middle = _start(images, valid, dentitions, fit, options, threads)
-        pairs = choose_pairs(photos, middle, options)
+        start = started_surface(images, valid, dentitions, fit, options, threads)
+        photos, charts = start.photos, start.charts
+        pairs = choose_pairs(photos, start.middle, options)
         near = replace(options, gum_height=min(options.gum_height, options.grow_from))
         for number, settings in enumerate(options.rounds if pairs else ()):
             progress("sweep", 2 + number, steps)
@@ -157,56 +157,43 @@ def dense_surface(
     )
 
 
-def completed_surface(
+@dataclass(frozen=True)
+class StartedSurface:
+    """The surface before anything has been measured of it.
+
+    Attributes:
+        photos: the photographs that were placed, prepared.
+        charts: the jaws, as the crown shapes have them.
+        middle: [3] of the landmarks, mm.
+        count: number of photographs.
+        options: settings.
+    """
+
+    photos: list[Photo]
+    charts: list[Chart]
+    middle: Array64
+    count: int
+    options: SurfaceOptions
+
+
+def started_surface(
     images: list[Array32],
     valid: list[Mask],
     dentitions: list[Dentition | None],
     fit: ArchFit,
-    depths: list[Array32],
     options: SurfaceOptions,
     threads: int,
-    full: Sequence[FullSize | None],
-) -> tuple[SurfaceView | None, ...]:
-    """Crowns and gum as they go on from depth that is measured, seen from each photograph.
-
-    Args:
-        images, valid, dentitions, fit, options, threads, full: as for `dense_surface`.
-        depths: [H, W] float32 z-depth of each image in mm, 0 where unknown.
-
-    Raises:
-        ValueError: as `dense_surface`.
-        ReconstructionError: what is measured lies elsewhere than the crowns.
-    """
-    _check_lengths(images, valid, dentitions, fit)
-    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
-        photos, charts, _ = _start(images, valid, dentitions, fit, options, threads)
-        bend_to(charts, photos, [depths[photo.index] for photo in photos], options)
-        return _look_at(charts, photos, full, options, threads).views_of(len(images))
-
-
-def _check_lengths(
-    images: list[Array32], valid: list[Mask], dentitions: list[Dentition | None], fit: ArchFit
-) -> None:
+) -> StartedSurface:
+    """Crown shapes between their landmarks; arguments and errors as for `dense_surface`."""
     if not len(images) == len(valid) == len(dentitions) == len(fit.views):
         raise ValueError(
             f"the surface needs one image, mask, dentition and camera per photograph, not "
             f"{len(images)}, {len(valid)}, {len(dentitions)} and {len(fit.views)}"
         )
-
-
-def _start(
-    images: list[Array32],
-    valid: list[Mask],
-    dentitions: list[Dentition | None],
-    fit: ArchFit,
-    options: SurfaceOptions,
-    threads: int,
-) -> tuple[list[Photo], list[Chart], Array64]:
-    """The photographs prepared, the charts as the crown shapes have them, and their middle [3]."""
     if not fit.shape:
         raise ValueError("the arch has no landmarks, so that there is no surface to make")
     middle = np.mean([fit.shape[mark] for mark in sorted(fit.shape)], axis=0)
-    photos = _prepare(images, valid, dentitions, fit, middle, options, threads)
+    photos = _prepare(images, valid, dentitions, fit, middle, threads)
     jaws: tuple[Jaw, ...] = ("upper", "lower")
     charts = [chart for jaw in jaws if (chart := start_chart(jaw, fit, options))]
     if not photos or not charts:
@@ -214,7 +201,27 @@ def _start(
             "no photograph was placed with a named tooth, so that there is no surface to make; see "
             "the labelled overlay of the crowns and pass --set init.dental.order or FDI hints"
         )
-    return photos, charts, middle
+    return StartedSurface(photos, charts, middle, len(images), options)
+
+
+def completed_surface(
+    start: StartedSurface, depths: list[Array32], threads: int, full: Sequence[FullSize | None]
+) -> tuple[SurfaceView | None, ...]:
+    """Crowns and gum as they go on from depth that is measured, seen from each photograph.
+
+    Args:
+        start: the crown shapes; they are bent in place.
+        depths: [H, W] float32 z-depth of each image in mm, 0 where unknown.
+        threads, full: as for `dense_surface`.
+
+    Raises:
+        ReconstructionError: what is measured lies elsewhere than the crowns.
+    """
+    with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
+        measured = [depths[photo.index] for photo in start.photos]
+        bend_to(start.charts, start.photos, measured, start.options)
+        looked = _look_at(start.charts, start.photos, full, start.options, threads)
+        return looked.views_of(start.count)
 
 
 @dataclass(frozen=True)
@@ -323,7 +330,6 @@ def _prepare(
     dentitions: list[Dentition | None],
     fit: ArchFit,
     middle: Array64,
-    options: SurfaceOptions,
     threads: int,
 ) -> list[Photo]:
     placed = [
