@@ -68,10 +68,13 @@ class DrawnBeside:
                     command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
                 )  # fmt: skip
+        with suppress(OSError):  # it died; the pages are written here then
+            self._tell("draw")
+
+    def _tell(self, what: str) -> None:
         if self._process is not None and self._process.stdin is not None:
-            with suppress(OSError):  # it died; the pages are written here then
-                self._process.stdin.write("draw\n")
-                self._process.stdin.flush()
+            self._process.stdin.write(f"{what}\n")
+            self._process.stdin.flush()
 
     def write(self) -> None:
         """Write the pages; here, where the process is not there or does not answer.
@@ -82,9 +85,10 @@ class DrawnBeside:
         from pipeline.studies.report import run_report
 
         answer = None
-        if self._process is not None:
-            with suppress(OSError, ValueError):
-                answer = json.loads(self._process.communicate("write\n")[0])
+        with suppress(OSError, ValueError):
+            self._tell("write")
+            if self._process is not None and self._process.stdout is not None:
+                answer = json.loads(self._process.stdout.readline())
         if answer is None:
             run_report(self._workspace)
         elif answer["error"] is not None:
