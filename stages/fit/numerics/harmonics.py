@@ -15,8 +15,9 @@ import numpy as np
 from numba import prange
 
 from pipeline.kernels import kernel
+from pipeline.kernels.threads import in_threads
 from stages.fit.arrays import Array, Floats, Integers
-from stages.splatting.threads import KERNELS
+from stages.splatting.threads import KERNELS, workers
 
 F = np.float32
 CHUNK = 256
@@ -29,8 +30,8 @@ CONSTANT = 0.01
 #: how far views give in that look from nearly the same side but want different colours: those that
 #: nothing is known from, and those that keep what they see
 WISHED, KEPT = 1e-2, 1e-4
-#: Gaussians that are turned in one go
-BLOCK = 16384
+#: Gaussians that a thread prepares in one go
+BLOCK = 4096
 
 
 @kernel(parallel=True)
@@ -89,12 +90,18 @@ def spread(
     """
     terms = harmonics.shape[1]
     start = np.ascontiguousarray(harmonics, np.float32)
-    seen = np.ascontiguousarray(np.moveaxis(basis, 0, 1), np.float64)  # [N, V, K]
-    grams = np.swapaxes(seen * (firmness * pixels.T)[:, :, None], 1, 2) @ seen
-    own = grams + LEAST * np.eye(terms)
-    own[:, range(1, terms), range(1, terms)] += np.diff(starts)[:, None]
-    blocks = np.linalg.inv(own).astype(np.float32)
-    grams = grams.astype(np.float32)
+    degrees = np.diff(starts)[:, None]
+    grams, blocks = (np.empty((len(start), terms, terms), np.float32) for _ in range(2))
+
+    def prepare(rows: slice) -> None:
+        seen = np.ascontiguousarray(np.moveaxis(basis[:, rows], 0, 1), np.float64)  # [B, V, K]
+        own = np.swapaxes(seen * (firmness * pixels[:, rows].T)[:, :, None], 1, 2) @ seen
+        grams[rows] = own
+        own += LEAST * np.eye(terms)
+        own[:, range(1, terms), range(1, terms)] += degrees[rows]
+        blocks[rows] = np.linalg.inv(own)
+
+    in_threads(prepare, _pieces(len(start)), workers())
     pull, better = np.empty_like(start), np.empty_like(start)
     with KERNELS:
         _stretched(start, np.zeros_like(grams), neighbours, starts, pull)
@@ -125,8 +132,8 @@ def reaching(harmonics: Floats, basis: Array, wanted: Array, sure: Array) -> Flo
         sure: [V, N] 1 where that must be so, 0 where it is a wish.
     """
     found, each = harmonics.copy(), range(len(basis))
-    for first in range(0, len(harmonics), BLOCK):
-        rows = slice(first, first + BLOCK)
+
+    def reach(rows: slice) -> None:
         seen = np.moveaxis(basis[:, rows], 0, 1)  # [B, V, K]
         missing = np.moveaxis(wanted[:, rows], 0, 1) - seen @ harmonics[rows]
         cheap = seen.copy()
@@ -134,7 +141,13 @@ def reaching(harmonics: Floats, basis: Array, wanted: Array, sure: Array) -> Flo
         overlap = cheap @ np.swapaxes(seen, 1, 2)
         overlap[:, each, each] += KEPT + (WISHED - KEPT) * (1 - sure[:, rows].T)
         found[rows] += np.swapaxes(cheap, 1, 2) @ np.linalg.solve(overlap, missing)
+
+    in_threads(reach, _pieces(len(harmonics)), workers())
     return found
+
+
+def _pieces(number: int) -> list[slice]:
+    return [slice(first, first + BLOCK) for first in range(0, number, BLOCK)]
 
 
 @kernel(parallel=True)
