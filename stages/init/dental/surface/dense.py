@@ -195,7 +195,8 @@ def started_surface(
     middle = np.mean([fit.shape[mark] for mark in sorted(fit.shape)], axis=0)
     photos = _prepare(images, valid, dentitions, fit, middle, threads)
     jaws: tuple[Jaw, ...] = ("upper", "lower")
-    charts = [chart for jaw in jaws if (chart := start_chart(jaw, fit, options))]
+    started = in_threads(lambda jaw: start_chart(jaw, fit, options), jaws, threads)
+    charts = [chart for chart in started if chart]
     if not photos or not charts:
         raise ValueError(
             "no photograph was placed with a named tooth, so that there is no surface to make; see "
@@ -219,7 +220,7 @@ def completed_surface(
     """
     with kernel_threads(threads), threadpool_limits(limits=1, user_api="blas"):
         measured = [depths[photo.index] for photo in start.photos]
-        bend_to(start.charts, start.photos, measured, start.options)
+        bend_to(start.charts, start.photos, measured, start.options, threads)
         looked = _look_at(start.charts, start.photos, full, start.options, threads)
         return looked.views_of(start.count)
 
@@ -269,10 +270,11 @@ def _look_at(
         at_full_size(photo, whole) if full and (whole := full[photo.index]) else photo
         for photo in photos
     ]
-    clear: list[Mask | None] = [
-        clearly_seen(chart, photos, nearest, options) if options.only_clear else None
-        for chart in charts
-    ]
+    clear: list[Mask | None] = [None] * len(charts)
+    if options.only_clear:
+        clear[:] = in_threads(
+            lambda chart: clearly_seen(chart, photos, nearest, options), charts, threads
+        )
     looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
     return _Looked(photos, shown, nearest, clear, looks)
 
@@ -288,8 +290,10 @@ def _sweep(
 ) -> None:
     """One round over all charts, in place; the first one looks for brackets as well."""
     nearest = nearest_depths(charts, photos, options.gum_height, threads)
-    seen = [comparable(chart, photos, nearest, options, settings.inset) for chart in charts]
-    for chart, shown in zip(charts, seen, strict=True):
+
+    @kernel_threads(threads)  # of the thread that it runs in
+    def swept(chart: Chart) -> None:
+        shown = comparable(chart, photos, nearest, options, settings.inset)
         trust = chart.gum_fades(options.gum_trust)
         if first:
             chart.hardware = shows_hardware(chart, photos, shown, pairs)
@@ -300,6 +304,8 @@ def _sweep(
             chart.used(PAST_EDGE, options.gum_height), settings, options,
         )  # fmt: skip
         chart.radius, chart.agreement = found.radius, found.weight
+
+    in_threads(swept, charts, threads)
 
 
 def _raise(

@@ -84,7 +84,7 @@ def _reduced(values: Array32, size: tuple[int, int]) -> npt.NDArray[np.float64]:
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float64)
 
 
-@lru_cache(maxsize=1)  # some MB: fits of one chart follow each other
+@lru_cache(maxsize=2)  # some MB each: fits of a jaw's chart follow each other
 def _plate(slow: int, fast: int, stiffness: float) -> npt.NDArray[np.float64]:
     """[2 fast + 1, slow * fast] lower band of the thin plate's matrix on a grid (slow, fast).
 

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import ReconstructionError
+from pipeline.kernels import kernel_threads
+from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart.grid import MEAN_RADIUS, ChartGrid, unroll
 from stages.init.dental.surface.chart.jaws import PAST_EDGE, Chart
@@ -29,7 +31,11 @@ _STIFFNESS = 4.0
 
 
 def bend_to(
-    charts: list[Chart], photos: list[Photo], depths: list[Array32], options: SurfaceOptions
+    charts: list[Chart],
+    photos: list[Photo],
+    depths: list[Array32],
+    options: SurfaceOptions,
+    threads: int = 1,
 ) -> None:
     """Bend the charts, in place, to what is measured; `Chart.agreement` says where that is.
 
@@ -38,13 +44,16 @@ def bend_to(
         photos: the photographs.
         depths: of each photograph [h, w] float32 z-depth in mm, 0 where unknown.
         options: settings.
+        threads: number of threads; does not change the result.
 
     Raises:
         ReconstructionError: it lies elsewhere than the crowns.
     """
     count = round(_REACH / _STEP)
     steps = (np.arange(-count, count + 1) * _STEP).astype(np.float32)
-    for chart in charts:
+
+    @kernel_threads(threads)  # of the thread that it runs in
+    def bent(chart: Chart) -> tuple[Array32, Array32]:
         offset, weight = _measured(chart, photos, depths)
         crowns = chart.used(0, 0) & (weight > 0)
         if crowns.any() and abs(float(np.median(offset[crowns]))) > _ELSEWHERE:
@@ -53,12 +62,13 @@ def bend_to(
                 "the depth that is measured there."
             )
         smooth = offset, weight, _STIFFNESS, options.anchor, options.outlier
-        if options.carve:
-            unmatched = chart.used(PAST_EDGE, options.gum_height) & (weight == 0)
-            void = in_void(chart.points, _outwards(chart.grid), steps, photos)
-            bend = carved(*smooth, void & unmatched[..., None], steps)
-        else:
-            bend = fit_offsets(*smooth)
+        if not options.carve:
+            return fit_offsets(*smooth), weight
+        unmatched = chart.used(PAST_EDGE, options.gum_height) & (weight == 0)
+        void = in_void(chart.points, _outwards(chart.grid), steps, photos)
+        return carved(*smooth, void & unmatched[..., None], steps), weight
+
+    for chart, (bend, weight) in zip(charts, in_threads(bent, charts, threads), strict=True):
         chart.radius, chart.agreement = chart.radius + bend, weight
 
 
