@@ -134,6 +134,8 @@ class ExportStage(Stage):
                     "No mesh was made: too little of the surface is known. More photographs that "
                     "overlap would help; the other exports are complete."
                 )
+            if config.preview:
+                beside.give(_write_preview, scene, mesh, folder)
             frames = _write_video(context, scene, folder) if config.video else None
         made = {
             "colmap_points": model_points() if model_points else None,
@@ -142,8 +144,6 @@ class ExportStage(Stage):
             "video_frames": frames,
         }
         counts |= {name: count for name, count in made.items() if count is not None}
-        if config.preview:
-            _write_preview(context, scene, mesh, folder)
         _describe(scene, folder, frame, scale, counts, skipped, self.libraries)
         context.summarize(
             splats=len(scene.gaussians),
@@ -305,16 +305,10 @@ def _write_page(context: StageContext, scene: Scene, folder: Path, knowledge: Kn
     return (folder / "viewer.html").write_bytes(page.encode())
 
 
-def _write_preview(
-    context: StageContext,
-    scene: Scene,
-    mesh: Mesh | None,
-    folder: Path,
-) -> None:
+def _write_preview(scene: Scene, mesh: Mesh | None, folder: Path) -> None:
     from pipeline.artifacts.views import to_uint8
     from stages.export.pictures.preview import beside, contact_sheet, panel_size, shade_mesh
 
-    context.progress("preview", 0, 1)
     middle = scene.orbit.middle()
     camera = panel_size(scene.cameras[middle])
     novel = beside(camera, scene.novel_camera())
@@ -326,7 +320,6 @@ def _write_preview(
     if mesh is not None:
         panels.append(("mesh, new viewpoint", shade_mesh(mesh, novel)))
     _write_image(folder / "preview.png", contact_sheet(panels, camera.width, camera.height))
-    context.progress("preview", 1, 1)
 
 
 def _describe(
