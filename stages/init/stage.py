@@ -183,10 +183,10 @@ def _from_features(context: StageContext, views: Views) -> None:
     by_teeth, options = ByTeeth(context, views), _classical_options(config)
     focals = with_focals(views.views, config.focal)
     told: list[str] = []
-    # what either way needs is loaded meanwhile
-    densify, teeth_first = side_by_side(
-        lambda: import_module("stages.init.densify").densify,
+    # what either way needs is loaded meanwhile; pycolmap in this thread, where signals can wait
+    teeth_first, dense = side_by_side(
         lambda: free and by_teeth.is_first(focals, options),
+        lambda: import_module("stages.init.densify"),
         context.threads,
     )
     if teeth_first:
@@ -225,7 +225,7 @@ def _from_features(context: StageContext, views: Views) -> None:
             told.append(f"The teeth do not place more of the photographs: {doubtful}")
     for text in told:
         context.warn(text)
-    densify(context, views, placement.normalised())
+    dense.densify(context, views, placement.normalised())
 
 
 def _classical_options(config: InitConfig) -> ClassicalOptions:

@@ -42,11 +42,11 @@ _TURNED = 4
 
 
 class PhotographReader:
-    """Reads the photographs of a case, each on one thread; they change nothing but the time.
+    """Reads the photographs of a case.
 
     Args:
         views: the photographs.
-        threads: how many are read side by side.
+        threads: how many are read side by side; changes nothing but the time.
     """
 
     def __init__(self, views: Sequence[View], threads: int) -> None:
