@@ -24,17 +24,24 @@ PHOTOGRAPHS = 4
 SHARP = 0.7
 
 
+def largest_size(number: int) -> int:
+    """The largest of `SIZES` that so many photographs may have."""
+    most = SIZES[0] * float(np.sqrt(min(1.0, PHOTOGRAPHS / max(number, 1))))
+    return next((size for size in SIZES if size <= most), SIZES[-1])
+
+
 def best_size(pictures: Sequence[Prepared]) -> int:
     """The largest of `SIZES` at which the photographs are sharp, and that their number allows.
 
     Args:
-        pictures: at the largest size; smaller ones count at theirs.
+        pictures: at the size that their number allows, or larger; smaller ones count at theirs.
     """
-    most = SIZES[0] * float(np.sqrt(min(1.0, PHOTOGRAPHS / max(len(pictures), 1))))
-    greys = [picture.rgb.mean(-1, dtype=np.float32) for picture in pictures]
+    most = largest_size(len(pictures))
+    greys: list[Floats] = []
     for size in SIZES[:-1]:
         if size > most:
             continue
+        greys = greys or [picture.rgb.mean(-1, dtype=np.float32) for picture in pictures]
         if np.median([sharpness(_reduced(grey, size)) for grey in greys]) >= SHARP:
             return size
     return SIZES[-1]

@@ -51,7 +51,7 @@ class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
@@ -90,7 +90,7 @@ class ViewsStage(Stage):
             prepared_views,
             shows_nothing,
         )
-        from stages.views.sharpness import SIZES, best_size
+        from stages.views.sharpness import best_size, largest_size
 
         config: ViewsConfig = context.config
         files = {k: v for k, v in context.sources.items() if not k.startswith(MASK_PREFIX)}
@@ -101,18 +101,22 @@ class ViewsStage(Stage):
 
         first = next(iter(files))
         from_video = is_video(PurePath(first))
+        wanted = (config.frames or FRAMES_OF_A_VIDEO) if from_video else len(files)
 
         def load(long_side: int) -> list[Loaded]:
             size = {"long_side": long_side, "min_side": config.min_side}
             if from_video:
                 return load_video(
-                    first, files[first], masks.get(first), config.frames or FRAMES_OF_A_VIDEO,
+                    first, files[first], masks.get(first), wanted,
                     threads=context.threads, progress=progress, **size,
                 )  # fmt: skip
             return load_photos(files, masks, threads=context.threads, progress=progress, **size)
 
         if config.long_side == "auto":
-            everything = load(SIZES[0])
+            size = largest_size(wanted)
+            everything = load(size)
+            if len(everything) < wanted and largest_size(len(everything)) > size:  # a short film
+                everything = load(largest_size(len(everything)))
             best = best_size([item.picture for item in everything])
             if any(max(item.picture.rgb.shape) > best for item in everything):
                 everything = load(best)

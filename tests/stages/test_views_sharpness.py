@@ -8,7 +8,7 @@ import pytest
 
 from stages.photographs.noise import noise_level
 from stages.photographs.sharpness import UNSHARP, sharpness, weakest_direction
-from stages.views.sharpness import SHARP, SIZES, best_size
+from stages.views.sharpness import SHARP, SIZES, best_size, largest_size
 from stages.views.working import Prepared
 
 
@@ -53,7 +53,9 @@ def test_noise_is_no_sharpness() -> None:
 
 def test_more_photographs_are_smaller() -> None:
     one = picture(scene(1))
-    assert [best_size([one] * n) for n in (3, 4, 6, 12, 24)] == [1024, 1024, 724, 512, 512]
+    numbers = 3, 4, 6, 12, 24
+    assert [best_size([one] * n) for n in numbers] == [1024, 1024, 724, 512, 512]
+    assert [largest_size(n) for n in numbers] == [1024, 1024, 724, 512, 512]
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])

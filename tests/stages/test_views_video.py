@@ -14,6 +14,9 @@ from PIL import Image
 
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
+from pipeline.untrusted.files import FILM, opened
+from stages.views.load import load_video
+from stages.views.reading.video import map_frames
 from stages.views.stage import ViewsConfig, ViewsStage
 from tests.films import read_frames
 
@@ -26,14 +29,18 @@ def level(index: int) -> int:
 
 
 def film(
-    path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96)
-) -> Path:
-    """Write a film whose frame n is of brightness `level(n)`, red at the top left."""
+    path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96),
+    coded: str = "",
+) -> Path:  # fmt: skip
+    """Write a film whose frame n is of brightness `level(n)`, red at the top left.
+
+    `coded` are options of x264.
+    """
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=Fraction(25))
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         if codec == "libx264":
-            stream.options = {"crf": "10", "threads": "1"}
+            stream.options = {"crf": "10", "threads": "1", "x264-params": coded}
         else:
             stream.bit_rate = 8_000_000
         for index in range(count):
@@ -75,6 +82,33 @@ def test_all_frames_of_a_short_film_and_any_thread_count(tmp_path: Path) -> None
     assert [frame.index for frame in one] == [0, 1, 2, 3, 4]
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a.rgb, b.rgb)
+
+
+@pytest.mark.parametrize(
+    ("name", "coded", "all_decoded"),
+    [
+        ("keys.mp4", "keyint=5:min-keyint=5", False),
+        ("keys.mkv", "keyint=5:min-keyint=5", False),
+        ("open.mp4", "keyint=5:min-keyint=5:open-gop=1:bframes=2", False),
+        ("few_keys.mp4", "keyint=infinite:scenecut=0", True),
+        ("no_whole_keys.mp4", "keyint=5:intra-refresh=1", True),
+        ("no_index.ts", "keyint=5:min-keyint=5", True),
+    ],
+)
+def test_frames_are_the_same_where_not_all_are_decoded(
+    tmp_path: Path, name: str, coded: str, all_decoded: bool
+) -> None:
+    path = film(tmp_path / name, count=35, coded=coded)
+    every = read_frames(path, 35)
+    decoded: set[int] = set()
+    with opened(path, FILM) as file:
+        chosen = map_frames(file, lambda frame: frame, 3, 1, lambda done, _: decoded.add(done))
+    assert [frame.index for frame in chosen] == [0, 17, 34]
+    assert indices_by_brightness(chosen) == [0, 17, 34]
+    for frame in chosen:
+        np.testing.assert_array_equal(frame.rgb, every[frame.index].rgb)
+        assert frame.seconds == every[frame.index].seconds
+    assert (21 in decoded) == all_decoded  # it is said of every tenth; frames 18 to 29 aren't used
 
 
 @pytest.mark.parametrize(
@@ -122,6 +156,21 @@ def test_stage_on_a_film(tmp_path: Path) -> None:
     assert views.views[0].image.shape == (48, 80, 3)
     assert views.views[0].source_size == (160, 96)
     assert context.figures["views"] == 3
+
+
+@pytest.mark.parametrize(("count", "times"), [(30, 1), (4, 2)])
+def test_a_film_is_read_at_the_size_that_its_frames_may_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, times: int
+) -> None:
+    sizes: list[int] = []
+
+    def noted(*positional: Any, long_side: int, **named: Any) -> Any:
+        sizes.append(long_side)
+        return load_video(*positional, long_side=long_side, **named)
+
+    monkeypatch.setattr("stages.views.load.load_video", noted)
+    run_stage(tmp_path / "a", film(tmp_path / "x.mp4", count=count))
+    assert sizes == [512, 1024][:times]  # fewer frames than were asked for may be larger
 
 
 def test_one_mask_for_the_film(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+from bisect import bisect_right
 from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 import av
@@ -17,25 +19,49 @@ from pipeline.untrusted.films import MAX_PIXELS, opened_film
 from stages.views.orientation import orientation_from_rotation
 from stages.views.sampling import uniform_indices
 
+#: Readers of films that hold an index of their frames.
+WITH_INDEX = ("mov", "matroska")
+
 for _module in pkgutil.walk_packages(av.__path__, "av."):  # it imports most of them when used
     if not _module.name.endswith((".__main__", ".datasets")):
         importlib.import_module(_module.name)
 
 
+@dataclass(frozen=True)
+class _Contents:
+    """What a film's packets say of its frames, in the order in which they are shown.
+
+    Attributes:
+        count: how many there are.
+        shown: [count] when each is shown, in units of the stream; empty where they don't tell.
+        keys: numbers of the key frames, at which decoding may start; empty where that is unknown.
+    """
+
+    count: int
+    shown: list[int] = field(default_factory=list)
+    keys: list[int] = field(default_factory=list)
+
+
 def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
     """Frames of the film behind an open descriptor.
 
-    The packets are counted first, then the film is decoded once; again if the count was wrong
-    (a damaged film, or one cut without re-encoding): then ``again`` comes, and the frames before it
-    don't count.
+    The packets are counted first. Then each frame is decoded from the key frame before it, or,
+    where packets don't tell these, the whole film once. If the film is not as its packets say
+    (damaged, or cut without re-encoding) ``again`` comes, and the frames before it don't count.
     """
     with os.fdopen(int(values["file"]), "rb") as file:
         try:
-            count = yield from _count_packets(file)
+            contents = yield from _contents(file)
+            count = contents.count
             if count == 0:
                 raise UnusableFile("has no video frames in it")
             wanted, threads = int(values["wanted"]), int(values["threads"])
-            found = yield from _decode(file, uniform_indices(count, wanted), count, threads)
+            indices = uniform_indices(count, wanted)
+            if contents.keys:
+                if (yield from _decode_from_keys(file, indices, contents, threads)):
+                    return
+                yield {"again": True}, []
+            found = yield from _decode(file, indices, count, threads)
             if found not in (0, count):
                 yield {"again": True}, []
                 yield from _decode(file, uniform_indices(found, wanted), found, threads)
@@ -46,17 +72,23 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
             raise UnusableFile(f"can't be read as a video ({reason})") from error
 
 
-def _count_packets(file: BinaryIO) -> Generator[Reply, None, int]:
-    """How many frames the film seems to have; says now and then that it is at work."""
-    count = 0
+def _contents(file: BinaryIO) -> Generator[Reply, None, _Contents]:
+    """What is in the film; says now and then that it is at work."""
+    packets: list[tuple[int | None, bool]] = []
     with opened_film(file) as container:
         stream = _video(container)
         check_size(stream.codec_context.width, stream.codec_context.height)
         for number, packet in enumerate(container.demux(stream)):
-            count += bool(packet.size and not packet.is_discard)
+            if packet.size and not packet.is_discard:
+                packets.append((packet.pts, packet.is_keyframe))
             if number % 500 == 0:
-                yield {"counted": count}, []
-    return count
+                yield {"counted": len(packets)}, []
+        known = container.format.name.startswith(WITH_INDEX)
+    timed = sorted((time, key) for time, key in packets if time is not None)
+    shown, keys = [time for time, _ in timed], [n for n, (_, key) in enumerate(timed) if key]
+    if not known or keys[:1] != [0] or len(set(shown)) < len(packets):
+        return _Contents(len(packets))
+    return _Contents(len(packets), shown, keys)
 
 
 def _video(container: Any) -> Any:
@@ -79,30 +111,67 @@ def check_size(width: int, height: int) -> None:
         )
 
 
+def _opened(container: Any, threads: int) -> Any:
+    stream = _video(container)
+    stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = threads
+    return stream
+
+
+def _reply(index: int, frame: Any, start: float) -> Reply:
+    """Frame number `index` of a film whose first is shown at `start` seconds."""
+    seconds = frame.time - start if frame.time is not None else index
+    turn = orientation_from_rotation(frame.rotation)
+    values = {"index": index, "orientation": turn, "seconds": round(float(seconds), 6)}
+    return values, [np.ascontiguousarray(frame.to_ndarray(format="rgb24"))]
+
+
+def _decode_from_keys(
+    file: BinaryIO, indices: list[int], contents: _Contents, threads: int
+) -> Generator[Reply, None, bool]:
+    """The frames at `indices`, no others but those between them and the key frames before them.
+
+    False if the film can't be entered at these, or a frame does not come when the packets say.
+    """
+    keys, at, start = contents.keys, -1, 0.0
+    with opened_film(file) as container:
+        stream = _opened(container, threads)
+        frames = container.decode(stream)
+        for index in indices:
+            key = keys[bisect_right(keys, index) - 1]
+            if key > at + 1:
+                try:
+                    container.seek(contents.shown[key], stream=stream)
+                except av.error.FFmpegError:
+                    return False
+                frames, at = container.decode(stream), key - 1
+            while at < index:
+                frame, at = next(frames, None), at + 1
+                if frame is None or frame.pts != contents.shown[at]:
+                    return False
+                check_size(frame.width, frame.height)
+                if at == 0:
+                    yield {"size": [frame.width, frame.height]}, []
+                    start = frame.time or 0.0
+                if at % 10 == 0:
+                    yield {"done": at + 1, "of": contents.count}, []
+            yield _reply(index, frame, start)
+    return True
+
+
 def _decode(
     file: BinaryIO, indices: list[int], count: int, threads: int
 ) -> Generator[Reply, None, int]:
     """The frames at `indices`; returns how many the film has."""
     chosen, start, index = set(indices), 0.0, -1
     with opened_film(file) as container:
-        stream = _video(container)
-        stream.thread_type = "AUTO"
-        stream.codec_context.thread_count = threads
-        for index, frame in enumerate(container.decode(stream)):
+        for index, frame in enumerate(container.decode(_opened(container, threads))):
             check_size(frame.width, frame.height)
             if index == 0:
                 yield {"size": [frame.width, frame.height]}, []
                 start = frame.time or 0.0
             if index in chosen:
-                seconds = frame.time - start if frame.time is not None else index
-                yield (
-                    {
-                        "index": index,
-                        "orientation": orientation_from_rotation(frame.rotation),
-                        "seconds": round(float(seconds), 6),
-                    },
-                    [np.ascontiguousarray(frame.to_ndarray(format="rgb24"))],
-                )
+                yield _reply(index, frame, start)
             if index % 10 == 0:
                 yield {"done": min(index + 1, count), "of": count}, []
     return index + 1
