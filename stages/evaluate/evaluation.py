@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -30,7 +29,7 @@ from stages.evaluate.images import pictures
 from stages.evaluate.images.perceptual import Lpips
 from stages.evaluate.images.score import Figures, summary_of
 from stages.evaluate.refinement import RefinementOptions, refine_camera
-from stages.evaluate.scene import Examiner
+from stages.evaluate.scene import Examiner, Rendered
 from stages.evaluate.support import LEGEND, beyond
 from stages.evaluate.truth import Truth, read_truth, scoring_mask
 from stages.splatting.support import SeenSurface
@@ -59,13 +58,12 @@ def labelled(sources: Mapping[str, Path], folder: str) -> dict[str, Path]:
     }
 
 
-def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
+def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Rendered]]) -> None:
     """Score every placed view, and held-out photographs, poses and geometry where truth is given.
 
     Args:
         context: of the stage.
-        render: (gaussians, camera, background, threads) -> object with `image` [H, W, 3], `alpha`
-            [H, W] and `depth` [H, W].
+        painter: (gaussians, background, threads) -> what draws the scene as a camera sees it.
 
     Raises:
         RequestError: no camera belongs to any of the views; the truth can't be used.
@@ -79,7 +77,7 @@ def evaluate(context: StageContext, render: Callable[..., Any]) -> None:
         held = kept_back.views
     cameras = _placed_cameras(views, context.load("cameras"))
     background = config.background or gaussians.background
-    draw = partial(render, gaussians, background=background, threads=context.threads)
+    draw = painter(gaussians, background=background, threads=context.threads)
     masks = labelled(context.sources, "masks")
     truth = _truth(context, [*views.views, *held])
     held = _straightened(context, views, cameras, held) if truth is not None else held
@@ -211,10 +209,10 @@ def _held_out(
         left = [v.source_name or v.name for v in held if v.name not in {s.name for s in scored}]
         context.warn(f"Held-out photographs without a true camera or pixels: {', '.join(left)}.")
     asked = tuple(TEST_PROTOCOLS) if config.test_poses == "both" else (config.test_poses,)
-    figures: dict[str, dict[str, Figures]] = {protocol: {} for protocol in asked}
     pictured = set(pictures.spread(len(scored), config.max_comparisons))
-    for index, view in enumerate(scored):
-        context.progress("held-out views", index, len(scored), view=view.source_name)
+
+    def examine(index: int) -> list[Figures]:
+        view, found = scored[index], []
         camera = registration.registered(truth.cameras[view.name])
         for protocol in asked:
             if protocol == "refined":
@@ -222,10 +220,21 @@ def _held_out(
                     examiner.render, view.image, view.valid(), camera, depth, RefinementOptions()
                 ).camera
             last = protocol == asked[-1]
-            figures[protocol][view.name], _ = examiner.examine(
-                view, camera, "heldout_", index in pictured and last, last, surfaces
+            found.append(
+                examiner.examine(
+                    view, camera, "heldout_", index in pictured and last, last, surfaces
+                )[0]
             )
-    context.progress("held-out views", len(scored), len(scored))
+        return found
+
+    examined = in_threads(
+        examine, range(len(scored)), context.threads,
+        lambda done: context.progress("held-out views", done, len(scored)),
+    )  # fmt: skip
+    figures = {
+        protocol: {view.name: found[number] for view, found in zip(scored, examined, strict=True)}
+        for number, protocol in enumerate(asked)
+    }
     blocks: dict[str, Any] = {
         protocol: {"protocol": TEST_PROTOCOLS[protocol], "views": those, **summary_of(those)}
         for protocol, those in figures.items()

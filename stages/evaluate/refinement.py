@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.rigid import moved_by
+from pipeline.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -182,7 +183,7 @@ def _descend(level: _Level, camera: Camera, depth: float, options: RefinementOpt
             break
         if slopes is None:
             slopes, fresh = _slopes(level, camera, image, unit), True
-        matrix, vector = _normal_equations(slopes, image - level.photo, counted)
+        matrix, vector = normal_equations(slopes, image - level.photo, counted)
         ridge = damping * float(np.trace(matrix)) / len(vector) + 1e-12
         step = np.zeros(6)
         step[level.motions] = -np.linalg.solve(matrix + ridge * np.eye(len(vector)), vector)
@@ -216,15 +217,44 @@ def _slopes(level: _Level, camera: Camera, image: Floats, unit: Array) -> list[F
     return slopes
 
 
-def _normal_equations(
-    slopes: list[Floats], residual: Floats, counted: Bools
-) -> tuple[Array, Array]:
-    """[M, M] and [M] of the step that lessens the weighted squares most."""
-    error = residual[counted].reshape(-1)
-    weight = 1 / np.maximum(np.abs(error), np.float32(_SMALLEST_ERROR))
-    columns = [slope[counted].reshape(-1) for slope in slopes]
-    weighted = [column * weight for column in columns]
-    # sums in numpy's own order: a BLAS product may differ with the number of threads
-    matrix = [[float(np.sum(a * b, dtype=np.float64)) for b in columns] for a in weighted]
-    vector = [float(np.sum(a * error, dtype=np.float64)) for a in weighted]
-    return np.array(matrix), np.array(vector)
+def normal_equations(slopes: list[Floats], residual: Floats, counted: Bools) -> tuple[Array, Array]:
+    """[M, M] and [M] of the step that lessens the weighted squares most.
+
+    Args:
+        slopes: M pictures [H, W, 3], change of the render by each motion.
+        residual: [H, W, 3] render less photograph; a pixel's weight is the inverse of its size.
+        counted: [H, W] pixels that are compared.
+    """
+    size = len(slopes) + 1
+    pictures, sums = np.stack([*slopes, residual]), np.zeros((size, size))
+    _add_products(
+        pictures.reshape(*pictures.shape[:2], -1), counted, np.float32(_SMALLEST_ERROR), sums
+    )
+    sums = np.tril(sums) + np.tril(sums, -1).T
+    return sums[:-1, :-1], sums[:-1, -1]
+
+
+@kernel(fastmath=True, nogil=True)
+def _add_products(pictures: Floats, counted: Bools, smallest: np.float32, sums: Array) -> None:
+    """Add the sums of products of every two pictures over the size of the last one.
+
+    Args:
+        pictures: [M, H, W * 3], the last one the errors.
+        counted: [H, W] pixels that are summed over.
+        smallest: errors count as at least so large.
+        sums: [M, M], whose lower half is added to.
+    """
+    number, height, width = pictures.shape
+    weighted = np.empty(width, np.float32)
+    weight = np.empty(width, np.float32)
+    for y in range(height):
+        for x in range(width):
+            error = max(abs(pictures[number - 1, y, x]), smallest)
+            weight[x] = 1 / error if counted[y, x // 3] else np.float32(0)
+        for a in range(number):
+            weighted[:] = pictures[a, y] * weight
+            for b in range(a + 1):
+                total = np.float32(0)
+                for x in range(width):
+                    total += weighted[x] * pictures[b, y, x]
+                sums[a, b] += total

@@ -20,7 +20,7 @@ class EvaluateStage(Stage):
     """Views, cameras and Gaussians -> metrics; more of them where the truth is known."""
 
     name = "evaluate"
-    version = 6
+    version = 7
     summary = "figures of input and held-out views, poses and geometry; side by side pictures"
     Config = EvaluateConfig
     requires = ("views", "cameras", "gaussians")
@@ -56,9 +56,9 @@ class EvaluateStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from stages.evaluate.evaluation import evaluate
-        from stages.splatting import render
+        from stages.splatting.rendering import Painter
 
-        evaluate(context, render)
+        evaluate(context, Painter)
 
 
 def _mesh_file(config: Any) -> Path:

@@ -9,8 +9,9 @@ from pipeline.artifacts.gaussians import Gaussians, Light
 from stages.export.mesh.field import colors_of, fuse
 from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.surface import Mesh
-from stages.export.pictures.frames import FramePainter
+from stages.export.pictures.frames import film_frame
 from stages.export.pictures.preview import shade_mesh
+from stages.splatting.rendering import Painter
 
 SIZE = 32
 
@@ -40,4 +41,4 @@ def film() -> None:
             place, np.array([[1, 0, 0, 0]], np.float32), -2 * one, np.ones(1, np.float32),
             np.ones((1, 16, 3), np.float32), lamp,
         )  # fmt: skip
-        FramePainter(gaussians, 0.1, threads=1)(_camera())
+        film_frame(Painter(gaussians, threads=1), _camera(), 0.1)

@@ -17,7 +17,7 @@ from stages.export.pictures.orbits import Orbit, central_depth, find_orbit, ther
 from stages.export.pictures.video import even
 from stages.export.splats import opacities
 from stages.splatting.frame import move_cameras, move_gaussians, move_points
-from stages.splatting.rendering import CONSTANT_HARMONIC, RenderedView, render
+from stages.splatting.rendering import CONSTANT_HARMONIC, Painter, RenderedView
 
 Progress = Callable[..., None]
 Pixels = npt.NDArray[np.uint8]
@@ -35,11 +35,11 @@ class Scene:
         photos, masks: by camera name, at working size: RGB [H, W, 3]; bool [H, W], True: usable.
         masked: whether any photograph came with a mask.
         gaussians: the fitted scene.
+        painter: draws it.
         points: the cloud it started from, or the centres of the Gaussians.
         seen: the Gaussians as each camera sees them.
         orbit: how the cameras stand around the scene.
         frame_from_world: [4, 4] similarity that led here.
-        threads: how many to render with.
     """
 
     cameras: tuple[Camera, ...]
@@ -47,18 +47,15 @@ class Scene:
     masks: dict[str, npt.NDArray[np.bool_]]
     masked: bool
     gaussians: Gaussians
+    painter: Painter
     points: Points
     seen: tuple[RenderedView, ...]
     orbit: Orbit
     frame_from_world: npt.NDArray[np.float64]
-    threads: int
-
-    def render(self, camera: Camera) -> RenderedView:
-        return render(self.gaussians, camera, threads=self.threads)
 
     def picture(self, camera: Camera) -> Pixels:
         """[H, W, 3] uint8 as a camera sees the Gaussians, black behind."""
-        return to_uint8(self.render(camera).image)
+        return to_uint8(self.painter(camera).image)
 
     def path(self, seconds: float, fps: int, sway_degrees: float) -> tuple[list[Camera], list[int]]:
         """Places of the video, at the (even) size of the middle photograph, and each frame's.
@@ -99,16 +96,17 @@ def assemble(
     moved = move_gaussians(gaussians, similarity)
     cloud = move_points(points, similarity) if points is not None else centres(moved)
     shown = [by_name[camera.name] for camera in placed]
-    seen = []
+    painter, seen = Painter(moved, threads=threads), []
     for index, camera in enumerate(placed):
         progress("views of the photographs", index, len(placed))
-        seen.append(render(moved, camera, threads=threads))
+        seen.append(painter(camera))
     return Scene(
         cameras=placed,
         photos={view.name: to_uint8(view.image) for view in shown},
         masks={view.name: view.valid() for view in shown},
         masked=any(view.mask is not None for view in shown),
         gaussians=moved,
+        painter=painter,
         points=cloud,
         seen=tuple(seen),
         orbit=find_orbit(
@@ -117,7 +115,6 @@ def assemble(
             np.array([0.0, 1.0, 0.0]) if frame.name == "mouth" else None,
         ),
         frame_from_world=similarity,
-        threads=threads,
     )
 
 

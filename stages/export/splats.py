@@ -22,14 +22,6 @@ def texels(degree: int) -> int:
     return 2 + -(-halfs_beyond // 8)
 
 
-def used_degree(gaussians: Gaussians) -> int:
-    """Highest spherical-harmonics degree with a coefficient that is not zero."""
-    return max(
-        (d for d in (1, 2, 3) if np.any(gaussians.sh[:, d * d : (d + 1) ** 2])),
-        default=0,
-    )
-
-
 def visible(gaussians: Gaussians, alpha_min: float) -> npt.NDArray[np.bool_]:
     """[N] bool: finite, and opaque enough to be drawn at all."""
     finite = np.isfinite(gaussians.means).all(1) & np.isfinite(gaussians.log_scales).all(1)

@@ -270,7 +270,7 @@ def _write_image(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 
 def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
-    from stages.export.pictures.frames import FramePainter
+    from stages.export.pictures.frames import film_frame
     from stages.export.pictures.video import Video
     from stages.export.viewer.page import rasterizer_constants
 
@@ -278,14 +278,15 @@ def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
     places, place_of_frame = scene.path(config.video_seconds, config.video_fps, config.video_sway)
     last = {place: index for index, place in enumerate(place_of_frame)}
     near = rasterizer_constants(scene.gaussians, scene.cameras)["near"]
-    paint = FramePainter(scene.gaussians, near, context.threads)
     size = (places[0].width, places[0].height)
     kept: dict[int, npt.NDArray[np.uint8]] = {}  # what the way back shows again
     file = folder / "orbit.mp4"
     with Video(file, size, config.video_fps, config.video_crf, context.threads > 1) as video:
         for index, place in enumerate(place_of_frame):
             context.progress("video", index, len(place_of_frame))
-            frame = kept.pop(place) if place in kept else paint(places[place])
+            frame = (
+                kept.pop(place) if place in kept else film_frame(scene.painter, places[place], near)
+            )
             video.add(frame)
             if index < last[place]:
                 kept[place] = frame

@@ -15,6 +15,7 @@ expressed in spherical harmonics, which is why this exists.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ from stages.splatting.kernels.shading import (
 )
 from stages.splatting.threads import KERNELS
 
-__all__ = ["ShadeGradients", "coefficients", "lit_scene", "shade", "shade_backward"]
+__all__ = ["LitScene", "ShadeGradients", "coefficients", "shade", "shade_backward"]
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -110,20 +111,35 @@ def shade_backward(
     return ShadeGradients(d_material, sums[:GLOBALS], np.concatenate([sums[GLOBALS:], np.zeros(3)]))
 
 
-def lit_scene(gaussians: Gaussians, centre: npt.NDArray[np.floating]) -> Floats:
-    """Gaussians with a light, as a camera at `centre` [3] sees them: packed [N, 14], degree 0.
+class LitScene:
+    """Gaussians with a light, for one camera after another, from any thread.
 
     Raises:
         ValueError: the Gaussians have no light.
     """
-    light = gaussians.light
-    if light is None:
-        raise ValueError("these Gaussians have no light; render their spherical harmonics")
-    packed = np.zeros((len(gaussians), LIT_COLUMNS), np.float32)
-    packed[:, 0:3] = gaussians.means
-    packed[:, 3:7] = gaussians.quats_wxyz
-    packed[:, 7:10] = gaussians.log_scales
-    packed[:, 10] = gaussians.logit_opacities
-    material = np.ascontiguousarray(np.concatenate([light.albedo, light.normals], 1), np.float32)
-    shade(packed, material, np.asarray(centre, np.float32), coefficients(light))
-    return packed
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        light = gaussians.light
+        if light is None:
+            raise ValueError("these Gaussians have no light; render their spherical harmonics")
+        self._packed = np.zeros((len(gaussians), LIT_COLUMNS), np.float32)
+        self._packed[:, 0:3] = gaussians.means
+        self._packed[:, 3:7] = gaussians.quats_wxyz
+        self._packed[:, 7:10] = gaussians.log_scales
+        self._packed[:, 10] = gaussians.logit_opacities
+        self._material = np.ascontiguousarray(
+            np.concatenate([light.albedo, light.normals], 1), np.float32
+        )
+        self._light = coefficients(light)
+        self._own = threading.local()
+
+    def seen_from(self, centre: npt.NDArray[np.floating]) -> Floats:
+        """[N, 14] packed, of degree 0, as a camera at `centre` [3] sees them.
+
+        The next call in the same thread writes it anew.
+        """
+        if not hasattr(self._own, "packed"):
+            self._own.packed = self._packed.copy()
+        packed: Floats = self._own.packed
+        shade(packed, self._material, np.asarray(centre, np.float32), self._light)
+        return packed

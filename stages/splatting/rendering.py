@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
+from pipeline.kernels import kernel
 from stages.splatting.harmonics import harmonics
 from stages.splatting.kernels.features import HARMONICS
-from stages.splatting.light import lit_scene
-from stages.splatting.rasterizer import Viewpoint, pack, rasterize, use_threads
+from stages.splatting.light import LitScene
+from stages.splatting.rasterizer import Rendering, Viewpoint, pack, rasterize, use_threads
 
 Floats = npt.NDArray[np.float32]
 
@@ -36,25 +37,82 @@ class RenderedView:
     depth: Floats
 
 
-def _as_seen(gaussians: Gaussians, camera: Camera) -> tuple[Floats, int]:
-    """The packed scene, and the degree of its harmonics."""
-    if gaussians.light is not None:
-        return lit_scene(gaussians, camera.centre), 0
-    # trailing harmonics that are zero everywhere cost time and change nothing
-    degree = 3
-    while degree > 0 and not gaussians.sh[:, degree * degree : (degree + 1) ** 2].any():
-        degree -= 1
-    packed = pack(
-        gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
-        gaussians.sh[:, : (degree + 1) ** 2],
-    )  # fmt: skip
-    return packed, degree
+def used_degree(gaussians: Gaussians) -> int:
+    """Highest spherical-harmonics degree with a coefficient that is not zero."""
+    return max(
+        (d for d in (1, 2, 3) if np.any(gaussians.sh[:, d * d : (d + 1) ** 2])),
+        default=0,
+    )
+
+
+class Painter:
+    """Draws the same Gaussians as one camera after another sees them, from any thread.
+
+    Args:
+        gaussians: the scene, with the light beside the camera where it has one.
+        background: sRGB colour behind everything; None: the scene's own.
+        threads: how many to use (None: all); never changes the result.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, background: Sequence[float] | None = None,
+        threads: int | None = None,
+    ) -> None:  # fmt: skip
+        self.background = np.array(
+            gaussians.background if background is None else background, np.float32
+        )
+        self._gaussians, self._threads = gaussians, threads
+        if gaussians.light is not None:
+            self._degree, self._lit = 0, LitScene(gaussians)
+            return
+        # trailing harmonics that are zero everywhere cost time and change nothing
+        self._degree = used_degree(gaussians)
+        self._packed = pack(
+            gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
+            gaussians.sh[:, : (self._degree + 1) ** 2],
+        )  # fmt: skip
+
+    def composited(self, camera: Camera, near: float, depth: bool) -> Rendering:
+        """What lies before the background: three planes of colour, and one of `depth`."""
+        use_threads(self._threads)
+        lit = self._gaussians.light is not None
+        packed = self._lit.seen_from(camera.centre) if lit else self._packed
+        return rasterize(packed, Viewpoint.of(camera), degree=self._degree, near=near, depth=depth)
+
+    def __call__(self, camera: Camera, near: float | None = None) -> RenderedView:
+        """See `render`."""
+        if near is None:
+            near = near_plane(self._gaussians, camera)
+        drawn = self.composited(camera, near, depth=True)
+        size = (camera.height, camera.width)
+        image, depth = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
+        _put_before(drawn.planes, drawn.transmittance, self.background, image, depth)
+        return RenderedView(image, 1 - drawn.transmittance, depth)
+
+
+@kernel(
+    "void(float32[:,:,::1], float32[:,::1], float32[::1], float32[:,:,::1], float32[:,::1])",
+    nogil=True,
+)
+def _put_before(  # type: ignore[no-untyped-def]
+    planes, transmittance, background, image, depth,
+):  # fmt: skip
+    """Image and depth of `RenderedView` from what was composited: planes [4, H, W]."""
+    height, width = depth.shape
+    for y in range(height):
+        for x in range(width):
+            left = transmittance[y, x]
+            for c in range(3):
+                image[y, x, c] = planes[c, y, x] + left * background[c]
+            alpha = np.float32(1) - left
+            divisor = max(alpha, np.float32(1e-8))
+            depth[y, x] = planes[3, y, x] / divisor if alpha > 0 else np.float32(0)
 
 
 def seen_colors(gaussians: Gaussians, camera: Camera) -> Floats:
     """[N, 3] the colour of each Gaussian as a camera sees it, not clipped above 1."""
     if gaussians.light is not None:
-        lit = lit_scene(gaussians, camera.centre)[:, HARMONICS : HARMONICS + 3]
+        lit = LitScene(gaussians).seen_from(camera.centre)[:, HARMONICS : HARMONICS + 3]
         return np.asarray(np.maximum(0.5 + CONSTANT_HARMONIC * lit, 0), np.float32)
     rays = gaussians.means - camera.centre
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-30)
@@ -94,6 +152,8 @@ def render(
 ) -> RenderedView:
     """Render Gaussians as a camera sees them, with the light beside it where they have one.
 
+    `Painter` does so for one camera after another.
+
     Args:
         gaussians: the scene.
         camera: with the size of the picture.
@@ -101,15 +161,4 @@ def render(
         threads: how many to use (None: all); never changes the result.
         near: near plane in world units; None: 2 % of the median depth in front of the camera.
     """
-    use_threads(threads)
-    packed, degree = _as_seen(gaussians, camera)
-    if near is None:
-        near = near_plane(gaussians, camera)
-    result = rasterize(packed, Viewpoint.of(camera), degree=degree, near=near, depth=True)
-    alpha = 1 - result.transmittance
-    behind = np.asarray(gaussians.background if background is None else background, np.float32)
-    image = result.planes[:3].transpose(1, 2, 0) + result.transmittance[..., None] * behind
-    depth = np.where(alpha > 0, result.planes[3] / np.maximum(alpha, 1e-8), 0)
-    return RenderedView(
-        np.ascontiguousarray(image, np.float32), alpha, np.asarray(depth, np.float32)
-    )
+    return Painter(gaussians, background, threads)(camera, near)

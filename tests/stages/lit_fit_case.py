@@ -13,7 +13,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
 from stages.fit.stage import FitConfig
 from stages.splatting import render
-from stages.splatting.light import lit_scene
+from stages.splatting.light import LitScene
 from stages.splatting.rasterizer import Viewpoint, rasterize
 
 WIDTH, HEIGHT = 96, 72
@@ -45,7 +45,7 @@ def looking(angle: float, name: str) -> Camera:
 
 
 def lit_image(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    packed = lit_scene(gaussians, camera.centre)
+    packed = LitScene(gaussians).seen_from(camera.centre)
     planes = rasterize(packed, Viewpoint.of(camera), degree=0, near=1.0).planes[:3]
     return np.clip(planes.transpose(1, 2, 0), 0, 1)
 

@@ -23,7 +23,7 @@ from pipeline.geometry.pose_metrics import (
 from pipeline.geometry.rigid import moved_by, rotation_angle
 from pipeline.geometry.similarity import camera_similarity, similarity
 from stages.evaluate.held_out import common_lens, register, without_lens
-from stages.evaluate.refinement import RefinementOptions, refine_camera
+from stages.evaluate.refinement import RefinementOptions, normal_equations, refine_camera
 from stages.splatting import render
 from tests.stages.evaluate_scene import arc, moved_world, pose, rotation, textured_scene
 
@@ -215,6 +215,19 @@ def test_refinement_finds_the_camera_again() -> None:
         lambda c: render(scene, c, threads=2), spoiled, valid, start, 3.0, RefinementOptions()
     )
     np.testing.assert_array_equal(again.camera.cam_from_world, refined.camera.cam_from_world)
+
+
+def test_normal_equations_are_those_of_the_weighted_squares() -> None:
+    rng = np.random.default_rng(3)
+    slopes = [rng.normal(size=(7, 9, 3)).astype(np.float32) for _ in range(3)]
+    residual = rng.normal(size=(7, 9, 3)).astype(np.float32) * np.float32(0.01)
+    counted = rng.random((7, 9)) < 0.6
+    matrix, vector = normal_equations(slopes, residual, counted)
+    errors = residual[counted].ravel().astype(np.float64)
+    columns = np.stack([slope[counted].ravel() for slope in slopes], 1).astype(np.float64)
+    weights = 1 / np.maximum(np.abs(errors), 0.002)
+    np.testing.assert_allclose(matrix, columns.T @ (weights[:, None] * columns), rtol=1e-4)
+    np.testing.assert_allclose(vector, columns.T @ (weights * errors), rtol=1e-4)
 
 
 def test_refinement_keeps_the_best() -> None:

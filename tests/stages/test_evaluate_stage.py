@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,9 +52,13 @@ class Darker:
         self.views, self.by, self.calls = views.by_name(), by, list[dict[str, Any]]()
 
     def __call__(
-        self, gaussians: Gaussians, camera: Camera, background: Any, threads: Any
-    ) -> Rendered:
-        self.calls.append({"name": camera.name, "background": background})
+        self, gaussians: Gaussians, background: Any, threads: Any
+    ) -> Callable[[Camera], Rendered]:
+        self.background = background
+        return self.draw
+
+    def draw(self, camera: Camera) -> Rendered:
+        self.calls.append({"name": camera.name, "background": self.background})
         image = self.views[camera.name].image
         assert image.shape[:2] == (camera.height, camera.width)
         alpha = np.zeros(image.shape[:2], np.float32)

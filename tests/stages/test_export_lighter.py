@@ -9,9 +9,8 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splats import used_degree
 from stages.export.viewer.lighter import with_degree
-from stages.splatting.rendering import seen_colors
+from stages.splatting.rendering import seen_colors, used_degree
 
 CENTRES = ([-3, 0, -5], [0, 0.5, -6], [3, 0, -5])
 

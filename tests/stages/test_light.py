@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.gaussians import Gaussians, Light
-from stages.splatting.light import coefficients, lit_scene, shade, shade_backward
+from stages.splatting.light import LitScene, coefficients, shade, shade_backward
 
 C0 = 0.28209479177387814
 COUNT = 600  # more than one chunk
@@ -106,7 +106,7 @@ def test_lit_scene_shows_a_highlight_where_the_surface_faces_the_camera() -> Non
         np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
         np.zeros((count, 16, 3), np.float32), light,
     )  # fmt: skip
-    colours = 0.5 + C0 * lit_scene(gaussians, np.zeros(3))[:, 11]
+    colours = 0.5 + C0 * LitScene(gaussians).seen_from(np.zeros(3))[:, 11]
     assert colours[0] == pytest.approx((0.5**2.2 + 0.54) ** (1 / 2.2), abs=1e-4)
     assert colours[0] > 0.8 > 0.5 > colours[1] > colours[2] > 0.1
     assert coefficients(light).tolist()[:2] == pytest.approx([0.9, 2.0])
@@ -118,4 +118,4 @@ def test_shapes_are_checked() -> None:
         shade(packed, material[:, :5], centre, LIGHT)
     bare = Gaussians(*(np.zeros((0, 3), np.float32),) * 5)
     with pytest.raises(ValueError, match="no light"):
-        lit_scene(bare, np.zeros(3))
+        LitScene(bare)

@@ -116,7 +116,7 @@ def fused(
     images, depths = [], []
     for index, camera in enumerate(cameras):
         progress("mesh", index, len(cameras))
-        seen = scene.seen[index] if index < len(scene.seen) else scene.render(camera)
+        seen = scene.seen[index] if index < len(scene.seen) else scene.painter(camera)
         eye_to_centre = float(np.linalg.norm(camera.centre - scene.orbit.centre))
         farthest = eye_to_centre + reach_behind * scene.orbit.radius
         if index < len(scene.seen):

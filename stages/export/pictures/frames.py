@@ -6,11 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.gaussians import Gaussians
 from pipeline.kernels import kernel
-from stages.export.splats import used_degree
-from stages.splatting.light import coefficients, shade
-from stages.splatting.rasterizer import Viewpoint, pack, rasterize, use_threads
+from stages.splatting.rendering import Painter
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -20,39 +17,18 @@ F = np.float32
 RED, GREEN, BLUE = F(0.2126), F(0.7152), F(0.0722)
 
 
-class FramePainter:
-    """Draws one frame after another of the same Gaussians.
+def film_frame(painter: Painter, camera: Camera, near: float) -> Bytes:
+    """[3 H / 2, W] uint8 planar 4:2:0, see `yuv420`.
 
     Args:
-        gaussians: the scene.
+        painter: of the scene.
+        camera: its width and height are even.
         near: near plane, world units.
-        threads: how many to render with; never changes the result.
     """
-
-    def __init__(self, gaussians: Gaussians, near: float, threads: int) -> None:
-        light = gaussians.light
-        self._light = None if light is None else coefficients(light)
-        self._degree = 0 if light is not None else used_degree(gaussians)
-        self._packed = pack(
-            gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
-            gaussians.sh[:, : (self._degree + 1) ** 2],
-        )  # fmt: skip
-        if light is not None:
-            columns = np.concatenate([light.albedo, light.normals], 1)
-            self._material = np.ascontiguousarray(columns, np.float32)
-        self._background = np.asarray(gaussians.background, np.float32)
-        self._near, self._threads = near, threads
-
-    def __call__(self, camera: Camera) -> Bytes:
-        """[3 H / 2, W] uint8 planar 4:2:0, see `yuv420`; the camera's width and height are even."""
-        use_threads(self._threads)
-        if self._light is not None:
-            centre = np.asarray(camera.centre, np.float32)
-            shade(self._packed, self._material, centre, self._light)
-        drawn = rasterize(self._packed, Viewpoint.of(camera), degree=self._degree, near=self._near)
-        frame = np.empty((3 * camera.height // 2, camera.width), np.uint8)
-        yuv420(drawn.planes, drawn.transmittance, self._background, frame)
-        return frame
+    drawn = painter.composited(camera, near, depth=False)
+    frame = np.empty((3 * camera.height // 2, camera.width), np.uint8)
+    yuv420(drawn.planes, drawn.transmittance, painter.background, frame)
+    return frame
 
 
 @kernel(nogil=True)

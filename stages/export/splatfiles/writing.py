@@ -16,9 +16,10 @@ from stages.export.splatfiles.order import morton_order, taken
 from stages.export.splatfiles.plain import with_constant_color
 from stages.export.splatfiles.sog import sog_bytes
 from stages.export.splatfiles.spz import spz_bytes
-from stages.export.splats import used_degree, visible
+from stages.export.splats import visible
 from stages.splatting.frame import move_gaussians
 from stages.splatting.rasterizer import ALPHA_CUT
+from stages.splatting.rendering import used_degree
 
 FULL, CONSTANT = "splats.ply", "splats_constant_colour.ply"
 COMPRESSED, SOG, SPZ = "splats.compressed.ply", "splats.sog", "splats.spz"

@@ -18,8 +18,8 @@ import numpy as np
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splats import used_degree
 from stages.splatting.harmonics import harmonics
+from stages.splatting.rendering import used_degree
 
 #: Cameras that are asked; those in between are as many as they have pairs.
 MOST_CAMERAS = 5

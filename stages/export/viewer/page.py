@@ -17,8 +17,9 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.space.scale import NO_SCALE
 from stages.export.pictures.orbits import Orbit
-from stages.export.splats import PER_ROW, texels, used_degree, visible
+from stages.export.splats import PER_ROW, texels, visible
 from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
+from stages.splatting.rendering import used_degree
 
 HERE = Path(__file__).parent
 #: What shows a scene and lets one turn it, on any page; and what the viewer adds.
