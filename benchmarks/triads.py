@@ -1,16 +1,19 @@
 """Real mouths: which cases become a scene, with which numbers, and what must not pass.
 
     python benchmarks/triads.py --data DIR [--out DIR] [--only CASE,...] [--mixes N] [--series]
-                                [--leave-one-out] [--threads 2] [--jobs 1] [--set FIELD=VALUE ...]
+                                [--pairs] [--leave-one-out] [--threads 2] [--jobs 1]
+                                [--set FIELD=VALUE ...]
 
 DIR holds `triads/` (three photographs and `truth.json` per patient) and perhaps `series/`
 (everything that a clinic took). Each case goes through the stages views, teeth and init as on the
 command line (init.method=dental, or as --set says). --mixes adds up to N mixes (120: all six
 sorts) of which none may become a scene unless what is wrong is put right: sides swapped in the
-file names must pass like the case itself. --series gives whole folders. OUT gets `triads.json`
-with every figure, `curve.png`, contact sheets (`cases_*.png`, `turned_*.png`, `series_*.png`,
-`mixes_*.png`: mixes that were accepted) and `readings/`, which makes the next run quicker:
-readings count again where neither the photograph nor the reader has changed.
+file names must pass like the case itself. --pairs takes two photographs of each case instead, the
+front and one side, and as mixes all ways to put another patient's in, or to mirror one. --series
+gives whole folders. OUT gets `triads.json` with every figure, `curve.png`, contact sheets
+(`cases_*.png`, `turned_*.png`, `series_*.png`, `mixes_*.png`: mixes that were accepted) and
+`readings/`, which makes the next run quicker: readings count again where neither the photograph nor
+the reader has changed.
 
 Found: a truth point lies inside a crown. Right: that crown has the point's number. A wrong number
 that is shown as doubtful is listed (with ?), but does not make a scene wrong. Points on crowns
@@ -35,7 +38,18 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from triads_data import CASE, SERIES, SORTS, SWAPPED, Item, make_mixes, read_cases, read_series
+from triads_data import (
+    CASE,
+    SERIES,
+    SORTS,
+    SWAPPED,
+    Item,
+    make_mixed_pairs,
+    make_mixes,
+    make_pairs,
+    read_cases,
+    read_series,
+)
 from triads_pictures import captioned, draw_curve, overlay_row, write_sheets
 from triads_run import Outcome, Picture, Runner
 from triads_scores import (
@@ -288,6 +302,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for figures, pictures and readings")
     parser.add_argument("--only", default="", help="cases, with commas between them")
     parser.add_argument("--mixes", type=int, default=0, metavar="N", help="so many mixes too")
+    parser.add_argument("--pairs", action="store_true", help="the front and one side alone")
     parser.add_argument("--series", action="store_true", help="whole folders too")
     parser.add_argument("--leave-one-out", action="store_true", help="print it for the thresholds")
     parser.add_argument("--threads", type=int, default=2)
@@ -312,12 +327,17 @@ def run(options: argparse.Namespace, folder: Path) -> None:
     results = Results([], {})
     rows = results.rows
     print(CASE_HEAD)
-    results.add(run_items(runner, cases, 1), case_line, folder)
+    shown = make_pairs(cases) if options.pairs else cases
+    results.add(run_items(runner, shown, 1), case_line, folder)
     if options.series:
         print(f"\n{SERIES_HEAD}")
         results.add(run_items(runner, series, 1), series_line, folder)
     if options.mixes:
-        mixes = make_mixes(cases, series, options.mixes)
+        mixes = (
+            make_mixed_pairs(cases)[: options.mixes]
+            if options.pairs
+            else make_mixes(cases, series, options.mixes)
+        )
         print(f"\n{len(mixes)} mixes:")
         # A coarse surface will do: only whether there is one counts.
         coarse = settings_of([*options.set, "dental.chart_density=5", "dental.cloud_spacing=1.0"])
@@ -327,12 +347,12 @@ def run(options: argparse.Namespace, folder: Path) -> None:
     found = thresholds(rows)
     print(
         f"lowest confidence that accepts no wrong one: {found['lowest_that_accepts_no_wrong']}; "
-        f"{found['cases_right_above_it']} of {len(cases)} cases are right and above it"
+        f"{found['cases_right_above_it']} of {len(shown)} cases are right and above it"
     )
     if options.leave_one_out:
         for entry in found["leave_one_out"]:
             print(f"- {entry}")
-        print(f"leave one out: {found['leave_one_out_passes']} of {len(cases)} cases pass")
+        print(f"leave one out: {found['leave_one_out_passes']} of {len(shown)} cases pass")
     if options.out:
         print(f"figures and sheets: {folder}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +126,31 @@ def read_series(data: Path, cases: list[Item]) -> list[Item]:
     return found
 
 
+def make_pairs(cases: list[Item]) -> list[Item]:
+    """The photograph from the front with that of one side, for either side."""
+    return [
+        replace(case, name=f"{case.name} {SLOTS[slot]}", photos=pair)
+        for case in cases
+        for slot, pair in ((0, case.photos[:2]), (2, case.photos[1:]))
+    ]
+
+
+def make_mixed_pairs(cases: list[Item]) -> list[Item]:
+    """Pairs of which one photograph is another patient's, or was mirrored."""
+    mixes = []
+    for case, other in product(cases, cases):
+        for side in (0, 2):
+            places, front = (side, 1), case.photos[1]
+            if case is not other:
+                changed = {side: other.photos[side]}
+                mixes.append(_with(case, ALIEN, changed, places))
+                continue
+            flipped = {side: replace(case.photos[side], mirrored=True)}
+            mixes.append(_with(case, MIRRORED_SIDE, flipped, places))
+            mixes.append(_with(case, MIRRORED_FRONT, {1: replace(front, mirrored=True)}, places))
+    return mixes
+
+
 def make_mixes(cases: list[Item], series: list[Item], count: int, seed: int = 0) -> list[Item]:
     """At most `count` mixes, of every sort in turn; fewer are the beginning of more."""
     rng = np.random.default_rng(seed)
@@ -162,11 +187,16 @@ def make_mixes(cases: list[Item], series: list[Item], count: int, seed: int = 0)
     return mixes[:count]
 
 
-def _with(case: Item, sort: str, changed: dict[int, Photo]) -> Item:
-    """The case with some photographs replaced; they take the names of those they replace."""
+def _with(
+    case: Item, sort: str, changed: dict[int, Photo], places: tuple[int, ...] = (0, 1, 2)
+) -> Item:
+    """The case with some photographs replaced; they take the names of those they replace.
+
+    `places` are those that the item has.
+    """
     photos = tuple(
-        replace(changed.get(slot, photo), shown=SLOTS[slot])
-        for slot, photo in enumerate(case.photos)
+        replace(changed.get(slot, case.photos[slot]), shown=SLOTS[slot]) for slot in sorted(places)
     )
     words = [f"{slot}:{photo.patient}/{photo.path.stem}" for slot, photo in sorted(changed.items())]
-    return Item(f"{case.name} with {' '.join(words)} ({sort})", sort, photos)
+    own = "".join(f" {SLOTS[slot]}" for slot in places if len(places) < 3 and slot not in changed)
+    return Item(f"{case.name}{own} with {' '.join(words)} ({sort})", sort, photos)

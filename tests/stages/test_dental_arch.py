@@ -187,6 +187,24 @@ def test_three_photographs(yaws: tuple[float, ...]) -> None:
     assert result.doubts == ()
 
 
+@pytest.mark.parametrize("shown", [(0, 1), (1, 2)])
+def test_two_photographs_one_of_them_from_the_front(shown: tuple[int, int]) -> None:
+    dentitions, poses, teeth = three()
+    result = fit([dentitions[k] for k in shown], QUICK)
+    for view, k in zip(result.views, shown, strict=True):
+        assert view.role == ("right", "frontal", "left")[k]
+        assert (view.upper, view.lower) == teeth[k]
+    # as of three photographs, and the arch's depth is less certain
+    assert max(rotation_errors(result, [poses[k] for k in shown])) < 8
+    assert result.doubts == ()
+
+
+def test_two_photographs_of_the_sides_alone_are_doubted() -> None:
+    dentitions, _, _ = three()
+    result = fit([dentitions[0], dentitions[2]], QUICK)
+    assert any("look like right and left views" in doubt for doubt in result.doubts)
+
+
 @pytest.mark.parametrize("height", [1.0, 1.25])
 def test_a_mouth_of_textbook_size_does_not_come_out_smaller(height: float) -> None:
     """Offsets in true millimetres would be the cheaper the smaller the arch; and long crowns as

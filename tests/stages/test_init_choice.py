@@ -49,8 +49,8 @@ def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatc
         ("unread", 3, None, {}),
         ("landscape", 3, none, {}),
         ("features", 3, read_teeth(), {"method": "colmap"}),
-        ("pair", 2, read_teeth(2), {}),
-        ("aside", 3, read_teeth(aside=(0,)), {}),
+        ("one_of_two", 2, read_teeth(2, aside=(0,)), {}),
+        ("aside", 3, read_teeth(aside=(0, 2)), {}),
     ]
     for name, count, read, settings in refused:
         with pytest.raises(ReconstructionError, match="could be placed"):
@@ -59,7 +59,9 @@ def test_teeth_are_tried_where_features_fail_and_only_there(tmp_path, monkeypatc
     auto(tmp_path / "teeth", 3, read_teeth())
     assert tried == [1]
     auto(tmp_path / "more", 4, read_teeth(4, aside=(3,)))
-    assert tried == [1, 1]
+    auto(tmp_path / "pair", 2, read_teeth(2))
+    auto(tmp_path / "one_aside", 3, read_teeth(aside=(0,)))
+    assert tried == [1, 1, 1, 1]
 
 
 def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
@@ -69,8 +71,8 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
     monkeypatch.setattr(
         "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
-    read = read_teeth(aside=(0,))
-    with pytest.raises(ReconstructionError, match=r"2 of 3 do \(p0.jpg: .*check.html") as caught:
+    read = read_teeth(aside=(0, 1))
+    with pytest.raises(ReconstructionError, match=r"1 of 3 do \(p0.jpg: .*check.html") as caught:
         auto(tmp_path / "a", 3, read)
     assert caught.value.artifacts == {"teeth": read}
     said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
@@ -158,6 +160,13 @@ def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_pa
         order.clear()
         auto(tmp_path / f"{linked}_{doubts}", 3, read_teeth())
         assert order == expected
+    for linked, first in ((1, "teeth"), (2, "features")):
+        monkeypatch.setattr(
+            "stages.init.dental.choice.sound", lambda *_, n=linked, **__: Sounding(n)
+        )
+        order.clear()
+        auto(tmp_path / f"pair_{linked}", 2, read_teeth(2))
+        assert order[0] == first
     order.clear()
     auto(tmp_path / "as_asked", 3, read_teeth(), method="colmap")
     assert order == ["features", "dense"]

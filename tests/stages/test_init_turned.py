@@ -107,6 +107,12 @@ def test_mirrored_sides_are_turned_back_where_names_tell_them() -> None:
     assert fit.asked == [(), (0, 2)], "the front fits the sides' mirror image as well"
 
 
+def test_of_two_photographs_none_is_turned_back() -> None:
+    fit = Fit(found(("right", "frontal"), mirrored=(1,)), {(1,): 0.9})
+    assert turned(fit, NAMES[:2]).mirrored == ()
+    assert fit.asked == [()]
+
+
 def test_names_that_say_nothing_leave_it_open_which_is_mirrored() -> None:
     fit = Fit(found(mirrored=(1,)), {(1,): 0.9, (0, 2): 0.9})
     assert turned(fit, NAMELESS).mirrored == ()
@@ -186,7 +192,7 @@ def test_photographs_that_take_no_part_stay() -> None:
         ("right frontal left", (), "left.jpg b.jpg right.jpg", []),
         ("right frontal frontal left", (1, 2), "right.jpg b c left.jpg", [(1, 2)]),
         ("right frontal frontal left", (1, 2), "left.jpg b c right.jpg", [(0, 3)]),
-        ("right frontal", (1,), "right.jpg b.jpg", [(1,)]),
+        ("right frontal", (1,), "right.jpg b.jpg", []),
         ("right frontal", (1,), "left.jpg b.jpg", [(0,)]),
         # All of one side: one may be the other side's mirror image, whatever the front says.
         ("right frontal right", (), "a.jpg b.jpg c.jpg", [(0,), (2,)]),

@@ -18,7 +18,10 @@ from stages.init.sfm.sounding import sound
 #: features do not stand (`roll.SMALLEST_ROLL`), for two may be turned against each other.
 UPRIGHT = 6.0
 #: How few and how many photographs the dental path takes on its own accord.
-DENTAL_VIEWS = (3, 12)
+DENTAL_VIEWS = (2, 12)
+#: So many photographs of a mouth, or all if there are fewer, features must place for teeth to know
+#: no more.
+ENOUGH = 3
 #: Of so many it is asked first whether features may link them: more around one mouth are never all
 #: as far apart as that they can't.
 SOUNDED_VIEWS = 6
@@ -80,7 +83,8 @@ class ByTeeth:
             focals: of each view in pixels, or None.
             options: of the attempt by features.
         """
-        if len(self.views) > SOUNDED_VIEWS or not self.to_try():
+        shown = self.to_try()
+        if len(self.views) > SOUNDED_VIEWS or not shown:
             return False
         sounding = sound(
             [view.gray() for view in self.views.views],
@@ -88,7 +92,7 @@ class ByTeeth:
             seed=self.context.seed, threads=self.context.threads, scratch=self.context.scratch,
         )  # fmt: skip
         self.features = sounding.features
-        return sounding.linked < DENTAL_VIEWS[0]
+        return sounding.linked < min(ENOUGH, len(shown))
 
     def knows_more(self, placed: set[str]) -> bool:
         """Would it place a mouth of which features have placed hardly any?
@@ -97,7 +101,7 @@ class ByTeeth:
         arch is known, are then missing. Features that do place enough of the mouth place it better.
         """
         shown = self.to_try()
-        return len(shown & placed) < DENTAL_VIEWS[0] <= len(shown)
+        return len(shown & placed) < min(ENOUGH, len(shown))
 
     def with_what_was_set_aside(self, unplaced: ReconstructionError) -> ReconstructionError:
         """The failure of features; with the photographs that are missing for the teeth, if any."""
@@ -108,10 +112,10 @@ class ByTeeth:
         aside = "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
         without = f" ({aside})" if aside else ""
         return ReconstructionError(
-            f"{unplaced} By their teeth at least {DENTAL_VIEWS[0]} photographs are needed that "
-            f"show the closed bite from the front and both sides, and {len(teeth.chosen)} of "
-            f"{len(teeth.views)} do{without}. Add what is missing; if one was set aside "
-            "wrongly or is a mirror image, say so in check.html.",
+            f"{unplaced} By their teeth photographs are needed that show the closed bite from the "
+            f"front and from one side, better from both, and {len(teeth.chosen)} of "
+            f"{len(teeth.views)} do{without}. Add what is missing; if one was set aside wrongly, "
+            "say so in check.html.",
             unplaced.pictures,
             {**unplaced.artifacts, "teeth": teeth},
         )

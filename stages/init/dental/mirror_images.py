@@ -14,6 +14,10 @@ from stages.init.dental.solution import ArchFit
 #: Places the photographs, with their teeth.
 Fit = Callable[[list[View], list[Dentition | None]], ArchFit]
 SIDES = {"right": "left", "left": "right"}
+#: Of so many photographs at least one from the front may be turned back. Of 24 pairs of it and one
+#: side (twelve patients) two look as if it were a mirror image, and pass, turned over, with numbers
+#: that are wrong.
+FRONT_TURNED = 3
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def turnings(fit: ArchFit, names: Sequence[str]) -> list[tuple[int, ...]]:
     if not fit.mirrored:
         return []
     if right and not wrong:
-        return [fit.mirrored]
+        return [fit.mirrored] if sum(map(bool, roles)) >= FRONT_TURNED else []
     return [tuple(sides)] if wrong and not right else []
 
 

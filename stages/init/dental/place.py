@@ -65,9 +65,9 @@ def from_teeth(context: StageContext, views: Views) -> None:
             doubtful.artifacts["teeth"] = updated(read, kept.views)
         raise
     for doubt in (
-        *teeth.fit.doubts, *in_another_light(names, teeth), *turned_back(names, teeth),
-        *misnamed(names, teeth), *numbered_otherwise(teeth, config.dental.min_margin),
-        *of_several_days(views, names),
+        *teeth.fit.doubts, *only_two(names, teeth), *in_another_light(names, teeth),
+        *turned_back(names, teeth), *misnamed(names, teeth),
+        *numbered_otherwise(teeth, config.dental.min_margin), *of_several_days(views, names),
     ):  # fmt: skip
         context.warn(doubt)
     numbered = replace(
@@ -86,6 +86,19 @@ def updated(read: TeethArtifact, numbered: Iterable[Dentition]) -> TeethArtifact
     """The teeth with some photographs' numbers replaced."""
     new = {dentition.name: dentition for dentition in numbered}
     return replace(read, views=tuple(new.get(view.name, view) for view in read.views), pictures={})
+
+
+def only_two(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say where only a photograph from the front and one from a side are in the scene."""
+    placed = [name for name, view in zip(names, teeth.fit.views, strict=True) if view is not None]
+    if len(placed) > 2:
+        return []
+    return [
+        f"The scene rests on two photographs alone ({' and '.join(placed)}): what a photograph of "
+        "the other side would show is missing or seen from the front only, and that one of the "
+        "two is a mirror image, or of another patient, shows less surely than with three. Add the "
+        "other side if there is one."
+    ]
 
 
 def turned_back(names: list[str], teeth: Reconstruction) -> list[str]:

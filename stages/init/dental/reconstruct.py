@@ -29,8 +29,6 @@ Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 
-#: With fewer photographs nothing contradicts a wrong numbering.
-LEAST_PHOTOGRAPHS = 3
 HOW_TO_SHOOT_TEETH = (
     "Take one photograph from the front and one from each side, 30 to 45 degrees apart, with the "
     "lips drawn back so that the gum line of all teeth shows, all sharp and at the same zoom; or a "
@@ -128,10 +126,10 @@ def place_teeth(
         ReconstructionError: no teeth, or the result is doubtful.
     """
     found = sum(dentition is not None for dentition in dentitions)
-    if found < (2 if accept_doubtful or cameras is not None else LEAST_PHOTOGRAPHS):
+    if found < 2:
         raise ReconstructionError(
             f"Rows of closed teeth, seen from the front or a side, were made out in {found} of "
-            f"{len(views)} photographs; three are needed. {HOW_TO_SHOOT_TEETH}",
+            f"{len(views)} photographs; two are needed, better three. {HOW_TO_SHOOT_TEETH}",
             evidence(overlays(views, dentitions)),
             {"teeth": Teeth(tuple(d for d in dentitions if d is not None))} if found else {},
         )

@@ -145,7 +145,7 @@ def fit_arch(
             others, shown, progress,
         )  # fmt: skip
         doubts += contradiction
-    elif len(placeable) == 3:
+    elif len(placeable) == 3 or (len(placeable) == 2 and held is None):
         doubts += role_doubts(best)
     cost, primary = primary_teeth(scorer, best, read)
     if perhaps_a_child:

@@ -277,8 +277,16 @@ def plain_role(role: str) -> str:
 
 
 def role_doubts(best: Scored) -> list[str]:
-    """Three photographs are one from each side and one from the front."""
+    """Three photographs are one from each side and one from the front, two of these the front and a
+    side: both sides share so few teeth that the angle between them may be off by any amount."""
     roles = best.labelling.roles
+    if len(roles) == 2 and ("frontal" not in roles or len(set(roles)) == 1):
+        return [
+            f"the two photographs look like {' and '.join(map(plain_role, roles))} views, and one "
+            "must be from the front, the other from a side"
+        ]
+    if len(roles) == 2:
+        return []
     absent = [role for role in MAIN_ROLES if role not in roles]
     if not absent:
         return []

@@ -203,7 +203,7 @@ class Scorer:
         total = options.cost_of_missing(labelling.absent) + self.looks(labelling)
         for view, labels in zip(labelling.views, labelling.labels, strict=True):
             total += self.row_costs(view, labels, labelling.absent)
-        if len(self.rows) == 3 and options.order is None:
+        if len(self.rows) <= 3 and options.order is None:
             total += REPEATED_ROLE_COST * (len(labelling.roles) - len(set(labelling.roles)))
         return total
 
@@ -406,7 +406,7 @@ def search(scorer: Scorer, candidates: dict[int, list[Scored]]) -> list[Scored]:
     states = candidates[order[0]]
     for view in order[1:]:
         mine = candidates[view]
-        repeated = len(scorer.rows) == 3 and scorer.options.order is None
+        repeated = len(scorer.rows) <= 3 and scorer.options.order is None
         pairs = sorted(
             (
                 state.score
