@@ -122,10 +122,12 @@ class ByTeeth:
 
 
 def neither(unplaced: ReconstructionError, doubtful: ReconstructionError) -> ReconstructionError:
-    """The failure of both ways."""
+    """The failure of both ways: that of the teeth as a whole, for it says what can be mended here;
+    of the texture that there was too little."""
+    texture = str(unplaced).split(". ")[0].rstrip(".")
     return ReconstructionError(
-        f"Neither the texture nor the teeth place these photographs safely. By texture: "
-        f"{unplaced} By teeth: {doubtful}",
+        f"Neither the texture nor the teeth place these photographs safely. By texture: {texture}. "
+        f"By teeth: {doubtful}",
         doubtful.pictures or unplaced.pictures,
         doubtful.artifacts,
     )
