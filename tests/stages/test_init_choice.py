@@ -1,5 +1,6 @@
 """Features or teeth: which of them places the photographs, and what is said of that."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
+from stages.init.dental.choice import ByTeeth
 from stages.init.placement import Placement
 from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.sounding import Sounding, sound
@@ -170,6 +172,31 @@ def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_pa
     order.clear()
     auto(tmp_path / "as_asked", 3, read_teeth(), method="colmap")
     assert order == ["features", "dense"]
+
+
+@pytest.mark.parametrize(
+    ("ordered", "aside", "roll", "upright"),
+    [
+        (False, (), 0.0, True),
+        (False, (), 0.3, False),
+        (False, (0,), 0.0, False),  # nobody knows how that one stands
+        (True, (0, 1, 2), 0.0, True),
+        (True, (0, 1, 2, 3, 5), 0.0, False),
+        (True, (0,), 0.3, False),
+    ],
+)
+def test_upright_rows_of_teeth_say_that_no_photograph_is_rolled(
+    tmp_path, ordered, aside, roll, upright
+):
+    views = replace(photographs(6), ordered=ordered)
+    read = Teeth(
+        tuple(replace(d, roll=roll if k == 4 else 0.0) for k, d in enumerate(
+            read_teeth(6, aside=aside).views
+        ))
+    )  # fmt: skip
+    inputs = {"views": views, "teeth": read}
+    context = LocalContext(InitConfig(), tmp_path, inputs, {}, threads=1)
+    assert ByTeeth(context, views).upright() == upright
 
 
 def test_a_sounding_tells_what_features_can_link(tmp_path):

@@ -112,6 +112,23 @@ def test_the_focal_length_comes_from_the_views(tmp_path):
     assert worst_rotation(solution, poses) < 0.3
 
 
+def test_the_other_mapper_is_asked_for_views_that_links_lead_to_only(tmp_path, monkeypatch):
+    given, _ = make_scene([-20, 0, 20], count=200)
+    alone = replace(
+        given, positions=[*given.positions, given.positions[0][:5]], lens_of_view=[0] * 4,
+        points=[*given.points, np.arange(5)],
+    )  # fmt: skip
+    for shown, left_out, asked in ((given, None, []), (alone, None, []), (alone, 2, ["global"])):
+        solver = Solver(shown, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+        best = solver.solve([FOCAL], False)
+        assert sorted(best.poses) == [0, 1, 2]
+        poses = {view: pose for view, pose in best.poses.items() if view != left_out}
+        mappers = []
+        monkeypatch.setattr(solver, "solve", lambda *args, to=mappers: to.append(args[2]))
+        solver.with_other_mapper(replace(best, poses=poses), False)
+        assert mappers == asked
+
+
 def test_threads_change_nothing(tmp_path):
     given, _ = make_scene([-15, 0, 15], count=200)
     first, second = (

@@ -69,12 +69,16 @@ class ByTeeth:
         return shown if DENTAL_VIEWS[0] <= len(shown) <= DENTAL_VIEWS[1] else set()
 
     def upright(self) -> bool:
-        """Do the rows of teeth say that no photograph is rolled against the others?"""
+        """Do the rows of teeth say that no photograph is rolled against the others?
+
+        Those in some frames of a film speak for all: a camera is not turned between two frames.
+        """
         if not self.context.has("teeth"):
             return False
         read = {dentition.name: dentition for dentition in self.context.load("teeth").chosen}
         rolls = [abs(math.degrees(read[v.name].roll)) for v in self.views.views if v.name in read]
-        return len(rolls) == len(self.views) and max(rolls) < UPRIGHT
+        enough = len(self.views) / 3 if self.views.ordered else len(self.views)
+        return len(rolls) >= max(enough, 1) and max(rolls) < UPRIGHT
 
     def is_first(self, focals: list[float | None], options: ClassicalOptions) -> bool:
         """Few photographs that features won't link: finding that out would take longest of all.

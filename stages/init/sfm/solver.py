@@ -13,6 +13,7 @@ from pipeline.geometry.graph import Pair
 from pipeline.kernels.threads import in_threads
 from stages.init.sfm.focal import better, search_focal
 from stages.init.sfm.mapping import Distortions, MappingInput, Solution, map_views
+from stages.init.sfm.matching.roll import groups
 from stages.init.sfm.matching.two_view import (
     Correspondences,
     TwoView,
@@ -108,8 +109,11 @@ class Solver:
         ]
 
     def with_other_mapper(self, best: Solution, free: bool) -> Solution:
-        """Try the global mapper where the incremental one left views out."""
-        if self.options.mapper != "auto" or self.complete(best):
+        """Try the global mapper where the incremental one left views out that links lead to."""
+        if self.options.mapper != "auto":
+            return best
+        group = groups(self.believed(self.edges_used(best)), self.view_count)
+        if len(best.poses) >= max(map(group.count, group)):
             return best
         other = self.solve(self.focals_of(best), free, "global")
         if other is None or len(other.poses) <= len(best.poses) or not self.sane(other):
