@@ -160,11 +160,12 @@ def place_teeth(
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
         shown = [f"{doubt[0].upper()}{doubt[1:].rstrip('.')}." for doubt in fit.doubts]
+        enough = " The front and one side are enough if the third does not belong." * (found == 3)
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
-            "Check the numbers in the labelled photographs; a wrong one can be put right on the "
-            f"page check.html. {HOW_TO_SHOOT_TEETH} If you know better, go on all the same: "
-            "--set init.dental.accept_doubtful=true.",
+            "Check the numbers in the labelled photographs; a wrong one can be put right, and a "
+            f"photograph left out, on the page check.html.{enough} {HOW_TO_SHOOT_TEETH} If you know "
+            "better, go on all the same: --set init.dental.accept_doubtful=true.",
             evidence(overlays(views, numbered)),
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
