@@ -164,8 +164,8 @@ def place_teeth(
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
             "Check the numbers in the labelled photographs; a wrong one can be put right, and a "
-            f"photograph left out, on the page check.html.{enough} {HOW_TO_SHOOT_TEETH} If you know "
-            "better, go on all the same: --set init.dental.accept_doubtful=true.",
+            f"photograph left out, on the page check.html.{enough} {HOW_TO_SHOOT_TEETH} If you "
+            "know better, go on all the same: --set init.dental.accept_doubtful=true.",
             evidence(overlays(views, numbered)),
             {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
         )
