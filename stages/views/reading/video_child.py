@@ -131,7 +131,8 @@ def _decode_from_keys(
 ) -> Generator[Reply, None, bool]:
     """The frames at `indices`, no others but those between them and the key frames before them.
 
-    False if the film can't be entered at these, or a frame does not come when the packets say.
+    False if the film can't be entered at these, or a frame comes damaged, or not when the packets
+    say.
     """
     keys, at, start = contents.keys, -1, 0.0
     with opened_film(file) as container:
@@ -147,7 +148,7 @@ def _decode_from_keys(
                 frames, at = container.decode(stream), key - 1
             while at < index:
                 frame, at = next(frames, None), at + 1
-                if frame is None or frame.pts != contents.shown[at]:
+                if frame is None or frame.is_corrupt or frame.pts != contents.shown[at]:
                     return False
                 check_size(frame.width, frame.height)
                 if at == 0:
