@@ -31,6 +31,7 @@ from stages.splatting.kernels.shading import (
     shade_kernel,
     shade_lanes,
 )
+from stages.splatting.rasterizer import pack
 from stages.splatting.threads import KERNELS
 
 __all__ = ["LitScene", "ShadeGradients", "coefficients", "shade", "shade_backward"]
@@ -114,6 +115,9 @@ def shade_backward(
 class LitScene:
     """Gaussians with a light, for one camera after another, from any thread.
 
+    Args:
+        gaussians: the scene.
+
     Raises:
         ValueError: the Gaussians have no light.
     """
@@ -122,11 +126,10 @@ class LitScene:
         light = gaussians.light
         if light is None:
             raise ValueError("these Gaussians have no light; render their spherical harmonics")
-        self._packed = np.zeros((len(gaussians), LIT_COLUMNS), np.float32)
-        self._packed[:, 0:3] = gaussians.means
-        self._packed[:, 3:7] = gaussians.quats_wxyz
-        self._packed[:, 7:10] = gaussians.log_scales
-        self._packed[:, 10] = gaussians.logit_opacities
+        self._packed = pack(
+            gaussians.means, gaussians.quats_wxyz, gaussians.log_scales, gaussians.logit_opacities,
+            np.zeros((len(gaussians), 1, 3), np.float32),
+        )  # fmt: skip
         self._material = np.ascontiguousarray(
             np.concatenate([light.albedo, light.normals], 1), np.float32
         )

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
 from stages.init.dental.choice import ByTeeth
+from stages.init.dental.place import only_two
 from stages.init.placement import Placement
 from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.sounding import Sounding, sound
@@ -197,6 +199,16 @@ def test_upright_rows_of_teeth_say_that_no_photograph_is_rolled(
     inputs = {"views": views, "teeth": read}
     context = LocalContext(InitConfig(), tmp_path, inputs, {}, threads=1)
     assert ByTeeth(context, views).upright() == upright
+
+
+@pytest.mark.parametrize(("placed", "said"), [((1, 1), 1), ((1, 0, 1), 1), ((1, 1, 1), 0)])
+def test_a_scene_of_two_photographs_is_said_to_be_one(placed, said):
+    names = [f"{k}.jpg" for k in range(len(placed))]
+    fit = SimpleNamespace(views=tuple(object() if there else None for there in placed))
+    told = only_two(names, SimpleNamespace(fit=fit))
+    assert len(told) == said
+    for name, there in zip(names, placed, strict=True):
+        assert all((name in text) == bool(there) for text in told)
 
 
 def test_a_sounding_tells_what_features_can_link(tmp_path):

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
+from pipeline.kernels.threads import in_threads
 from stages.splatting.light import LitScene, coefficients, shade, shade_backward
+from stages.splatting.rendering import Painter, render
 
 C0 = 0.28209479177387814
 COUNT = 600  # more than one chunk
@@ -93,6 +96,29 @@ def test_gradients_against_finite_differences() -> None:
         numeric = loss(packed, material, moved[0], LIGHT) - loss(packed, material, moved[1], LIGHT)
         assert result.pose[axis] == pytest.approx(numeric / step / 2, rel=1e-4, abs=1e-5)
     assert not result.pose[3:].any()
+
+
+def test_a_lit_scene_is_drawn_the_same_from_many_threads() -> None:
+    rng = np.random.default_rng(4)
+    means = rng.normal(size=(60, 3)).astype(np.float32) * 0.3 + np.array([0, 0, 3], np.float32)
+    normals = -means / np.linalg.norm(means, axis=1, keepdims=True)
+    light = Light(
+        rng.random((60, 3)).astype(np.float32), normals, 0.5, 1.0, 3.0, (60.0, 12.0), (0.5, 0.05)
+    )
+    gaussians = Gaussians(
+        means, np.tile(np.array([1, 0, 0, 0], np.float32), (60, 1)),
+        np.full((60, 3), -2, np.float32), np.ones(60, np.float32),
+        np.zeros((60, 16, 3), np.float32), light,
+    )  # fmt: skip
+    poses = [np.eye(4) for _ in range(8)]
+    for k, pose in enumerate(poses):
+        pose[0, 3] = 0.1 * k
+    cameras = [Camera(f"{k}", 48, 36, 60.0, 60.0, 24, 18, pose) for k, pose in enumerate(poses)]
+    painter = Painter(gaussians)
+    together = in_threads(painter, cameras, 4)
+    for camera, drawn in zip(cameras, together, strict=True):
+        np.testing.assert_array_equal(drawn.image, render(gaussians, camera, threads=1).image)
+    assert not np.array_equal(together[0].image, together[-1].image)
 
 
 def test_lit_scene_shows_a_highlight_where_the_surface_faces_the_camera() -> None:

@@ -130,7 +130,7 @@ def read_visit(workspace: Path) -> Visit:
         RequestError: no run, an unfinished one, or one without teeth.
     """
     from pipeline.studies.report.reading import read_case
-    from stages.splatting.rendering import render
+    from stages.splatting.rendering import Painter
 
     case = read_case(workspace)
     if case.failed is not None:
@@ -149,13 +149,13 @@ def read_visit(workspace: Path) -> Visit:
             )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()
-    looks, pictures = [], []
+    paint, looks, pictures = Painter(gaussians), [], []
     for camera in cameras.cameras:
         dentition = read.get(camera.name)
         view = by_name.get(camera.name)
         if dentition is None or view is None or dentition.set_aside:
             continue
-        rendered = render(gaussians, camera)
+        rendered = paint(camera)
         known = (rendered.alpha >= LEAST_ALPHA) & (rendered.depth > 0)
         pictures.append(view.image)
         looks.append(
