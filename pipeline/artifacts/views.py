@@ -67,6 +67,21 @@ class View:
         lying = abs(linear[0, 1]) > abs(linear[0, 0])  # stored on its side
         return (height, width) if lying else (width, height)
 
+    @property
+    def working_from_upright(self) -> npt.NDArray[np.float64]:
+        """[3, 3] map of pixel coordinates from the photograph as it was taken, turned upright."""
+        if min(self.source_size) <= 0:
+            return np.eye(3)
+        upright_from_source = np.eye(3)
+        turn = np.sign(np.round(self.working_from_source[:2, :2], 9))
+        upright_from_source[:2, :2] = turn
+        upright_from_source[:2, 2] = -np.minimum(turn, 0) @ self.source_size
+        return np.asarray(self.working_from_source @ np.linalg.inv(upright_from_source))
+
+    def working_place(self, upright: tuple[float, float]) -> npt.NDArray[np.float64]:
+        """[2] pixel of `image` for a pixel of the upright photograph."""
+        return np.asarray((self.working_from_upright @ (*upright, 1.0))[:2])
+
     def mirrored(self) -> View:
         """The picture turned over, left for right."""
         turned = np.array([[-1.0, 0, self.width], [0, 1, 0], [0, 0, 1]])

@@ -95,9 +95,7 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
     crowns = list(dentition.all_crowns)
     moved = False
     for k, change in enumerate(photo.crowns):
-        index = _crown_at(
-            crowns, working_place(view, change.at), change.at, f"{where}, crowns[{k}]"
-        )
+        index = _crown_at(crowns, view.working_place(change.at), change.at, f"{where}, crowns[{k}]")
         moved |= _change(crowns, index, change, view, f"{where}, crowns[{k}]")
     kind = photo.kind or dentition.kind
     set_aside = dentition.set_aside
@@ -134,7 +132,7 @@ def _change(
     if change.split is None:
         del crowns[index]
         return True
-    start, end = (working_place(view, place) for place in change.split)
+    start, end = (view.working_place(place) for place in change.split)
     parts = split_polygon(crown.outline, start, end)
     areas = [area(part) for part in parts]
     unknown = replace(crown, number=0, doubt=1.0, numbers={})
@@ -181,12 +179,6 @@ def _crown_at(crowns: list[Crown], place: Array, said: Place, where: str) -> int
 
 def _said(place: Place) -> str:
     return f"{place[0]:g}, {place[1]:g}"
-
-
-def working_place(view: View, place: Place) -> Array:
-    """[2] pixel of the view for a pixel of the upright photograph."""
-    width, height = view.upright_size
-    return np.array([place[0] * view.width / width, place[1] * view.height / height])
 
 
 def split_polygon(polygon: Array, start: Array, end: Array) -> tuple[Array, Array]:

@@ -73,10 +73,12 @@ def scoring_mask(files: Mapping[str, Path], view: View) -> Mask | None:
             f"evaluate.masks: the mask {path} {error}. Mend it, or leave it out."
         ) from error
     height, width = stored.shape
+    upright = view.upright_size
     if (width, height) == view.source_size:
         source_from_working = np.linalg.inv(view.working_from_source)
-    elif abs(np.log(width * view.height / (height * view.width))) < 0.02:
-        source_from_working = np.diag([width / view.width, height / view.height, 1.0])
+    elif abs(np.log(width * upright[1] / (height * upright[0]))) < 0.02:
+        scale = np.diag([width / upright[0], height / upright[1], 1.0])
+        source_from_working = scale @ np.linalg.inv(view.working_from_upright)
     else:
         raise RequestError(
             f"evaluate.masks: {path.name} has {width} x {height} pixels, but the photograph "

@@ -63,7 +63,7 @@ def mm_per_unit(
     """
     rays, depths, unsure = [], [], []
     for name, point in (("start", start), ("end", end)):
-        pixel = working_pixel(view, point)
+        pixel = view.working_place(point)
         if not (0 <= pixel[0] < view.width and 0 <= pixel[1] < view.height):
             raise RequestError(
                 f"init.length.{name}: {point[0]:g}, {point[1]:g} is outside the photograph "
@@ -95,12 +95,6 @@ def mm_per_unit(
         pixel_mm = z * np.array([along[0] / camera.fx, along[1] / camera.fy])
         shares.append(CLICK_DEVIATION * float(np.linalg.norm(pixel_mm)) / length)
     return mm / length, float(np.linalg.norm(shares))
-
-
-def working_pixel(view: View, point: tuple[float, float]) -> Array:
-    """[2] pixel of the view for a pixel of the upright photograph."""
-    width, height = view.upright_size
-    return np.array([point[0] * view.width / width, point[1] * view.height / height])
 
 
 def depth_near(depth: npt.NDArray[np.float32], pixel: Array, radius: int = 3) -> float | None:

@@ -94,8 +94,8 @@ def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
         Labels are file names; where two files share one, the folder's name comes before it.
 
     Raises:
-        RequestError: something is missing, unreadable or not an image; a video among images; fewer
-            than two images.
+        RequestError: something is missing, unreadable or not an image; a video among images;
+            nothing.
     """
     files: dict[Path, None] = {}
     for item in requested:
@@ -112,11 +112,9 @@ def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
                 "name only the video, or only the photographs."
             )
         return {printable(videos[0].name): videos[0]}
-    if len(paths) < 2:
-        what = f"only {printable(paths[0].name)} was named" if paths else "none was named"
+    if not paths:
         raise RequestError(
-            "A 3D scene needs at least two photographs from different sides, better three or more; "
-            f"{what}. Name a folder of photographs, several files, or a video."
+            "No photograph was named. Name a folder of photographs, several files, or a video."
         )
     labels = _labels(paths)
     return {label: labels[label] for label in sorted(labels, key=natural_key)}

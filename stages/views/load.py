@@ -16,7 +16,8 @@ from pipeline.errors import RequestError
 from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, read
 from stages.views.reading.apart import Decoder
 from stages.views.reading.video import VideoFrame, map_frames
-from stages.views.working import Mask, Prepared, check_size, prepare
+from stages.views.sheets import photographs_in
+from stages.views.working import Box, Mask, Prepared, check_size, prepare
 
 Progress = Callable[[int, int], None]
 
@@ -26,7 +27,8 @@ class Loaded:
     """A prepared picture and where it comes from.
 
     Attributes:
-        source_name: label of the file; for a frame of a video with ``#`` and its number.
+        source_name: label of the file; for a frame of a video with ``#`` and its number, for one of
+            several photographs in a picture with ``#1``, ``#2``, ...
         source_sha256: of the file.
         picture: what it looks like.
         timestamp: seconds from the first frame of the video, or None.
@@ -42,7 +44,7 @@ class Loaded:
 
 def load_photos(
     files: Mapping[str, Path], masks: Mapping[str, Path], long_side: int, min_side: int,
-    threads: int = 1, progress: Progress = lambda done, total: None,
+    cut_sheets: bool = True, threads: int = 1, progress: Progress = lambda done, total: None,
 ) -> list[Loaded]:  # fmt: skip
     """Load photographs.
 
@@ -50,6 +52,8 @@ def load_photos(
         files: label -> image file.
         masks: label of an image -> mask file.
         long_side, min_side: of the result, pixels.
+        cut_sheets: cut pictures into the photographs they hold (`photographs_in`); those that touch
+            are looked for where there is one file only.
         threads: how many to decode at a time; memory grows with it.
         progress: called with (done, total).
 
@@ -57,29 +61,42 @@ def load_photos(
         RequestError: some can't be used; all of them are named.
     """
 
-    def load(label: str) -> Loaded | str:
+    def load(label: str) -> list[Loaded] | str:
         try:
             data = read(files[label], PHOTOGRAPH)
-            check = partial(check_size, long_side=long_side, min_side=min_side)
-            photo = decoder.photo(data, check)
+            # a row of photographs is long and low: these are checked one by one
+            check = partial(check_size, min_side=min_side)
+            fits = partial(check, long_side=long_side)
+            photo = decoder.photo(data, partial(check, long_side=None) if cut_sheets else fits)
             mask = _read_mask(masks[label], decoder) if label in masks else None
-            picture = prepare(
-                photo.rgb, photo.valid, photo.orientation, photo.focal_px, long_side, mask
-            )
+            whole = Box(0, 0, *photo.rgb.shape[:2])
+            boxes = [whole]
+            if cut_sheets:
+                boxes = photographs_in(photo.rgb, touching=len(files) == 1)
+            for box in boxes:
+                fits(box.right - box.left, box.bottom - box.top)
+            focal = photo.focal_px if len(boxes) == 1 else None
+            pictures = [
+                prepare(photo.rgb, photo.valid, photo.orientation, focal, long_side, mask, box)
+                for box in boxes
+            ]
         except UnusableFile as error:
             return f"{label} {error}"
         digest = hashlib.sha256(data).hexdigest()
-        return Loaded(label, digest, picture, taken_at=photo.taken_at)
+        if len(pictures) == 1:
+            return [Loaded(label, digest, pictures[0], taken_at=photo.taken_at)]
+        return [Loaded(f"{label}#{k}", digest, picture) for k, picture in enumerate(pictures, 1)]
 
-    loaded, problems = [], []
+    loaded: list[Loaded] = []
+    problems: list[str] = []
     with Decoder() as decoder, ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
         try:
             for number, result in enumerate(pool.map(load, files), 1):
                 progress(number, len(files))
-                if isinstance(result, Loaded):
-                    loaded.append(result)
-                else:
+                if isinstance(result, str):
                     problems.append(result)
+                else:
+                    loaded += result
         except BaseException:  # an interrupt does not wait for what is being decoded
             decoder.stop()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -91,18 +108,24 @@ def load_photos(
 
 def load_video(
     label: str, path: Path, mask: Path | None, frames: int, long_side: int, min_side: int,
-    threads: int = 1, progress: Progress = lambda done, total: None,
+    cut_border: bool = True, threads: int = 1, progress: Progress = lambda done, total: None,
 ) -> list[Loaded]:  # fmt: skip
     """Load uniformly chosen frames of a video; a mask serves for all of them.
+
+    Args:
+        cut_border: cut off what most frames have around them, such as the bars beside a film that
+            was taken upright.
 
     Raises:
         RequestError: the video or the mask can't be used.
     """
 
-    def prepared(frame: VideoFrame) -> tuple[int, float, Prepared]:
-        picture = prepare(frame.rgb, None, frame.orientation, None, long_side, given)
-        return frame.index, frame.seconds, picture
+    def prepared(frame: VideoFrame) -> tuple[int, float, Prepared, list[Box]]:
+        within = photographs_in(frame.rgb) if cut_border and box is None else []
+        picture = prepare(frame.rgb, None, frame.orientation, None, long_side, given, box)
+        return frame.index, frame.seconds, picture, within
 
+    box: Box | None = None
     try:
         check = partial(check_size, long_side=long_side, min_side=min_side)
         given = None
@@ -111,17 +134,36 @@ def load_video(
                 given = _read_mask(mask, decoder)
         with opened(path, FILM) as file:
             found = map_frames(file, prepared, frames, threads, progress, check)
+            if cut_border:
+                box = _common_border([entry[2] for entry in found], [entry[3] for entry in found])
+            if box is not None:
+                file.seek(0)
+                found = map_frames(file, prepared, frames, threads, progress, check)
             file.seek(0)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         return [
             Loaded(f"{label}#{index}", digest, picture, seconds)
-            for index, seconds, picture in found
+            for index, seconds, picture, _ in found
         ]
     except UnusableFile as error:
         raise RequestError(
             f"The video {label} {error}. Check that it plays, save it again as MP4 (H.264), or "
             "export single frames and name their folder instead."
         ) from error
+
+
+def _common_border(pictures: Sequence[Prepared], parts: Sequence[Sequence[Box]]) -> Box | None:
+    """What most frames of a film are within; None where that is all of them.
+
+    Args:
+        pictures: the frames.
+        parts: of each, the photographs in it.
+    """
+    width, height = pictures[0].source_size
+    whole = Box(0, 0, height, width)
+    boxes = [found[0] if len(found) == 1 else whole for found in parts]
+    common = Box(*np.median(boxes, axis=0).astype(int).tolist())
+    return None if common == whole else common
 
 
 def drop_duplicates(

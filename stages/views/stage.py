@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -45,13 +45,18 @@ class ViewsConfig(StageConfig):
         "film.mp4#12); no stage but evaluate sees them",
     )
     deduplicate: bool = Field(True, description="leave out photographs that are there twice")
+    cut_sheets: bool = Field(
+        True,
+        description="cut a picture that holds several photographs side by side into these, and a "
+        "border off",
+    )
 
 
 class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
@@ -67,7 +72,9 @@ class ViewsStage(Stage):
     def sources(self, config: ViewsConfig, request: Mapping[str, Any]) -> Mapping[str, Path]:
         files = find_images(request["images"])
         masks = find_masks(config.masks, files) if config.masks is not None else {}
-        held = () if is_video(PurePath(next(iter(files)))) else held_labels(files, config.held_out)
+        # frames of a film and photographs of a sheet are known when these are read
+        of_files = [name for name in config.held_out if name.rpartition("#")[0] not in files]
+        held = () if is_video(PurePath(next(iter(files)))) else held_labels(files, of_files)
         inputs = [label for label in files if label not in held]
         kept = {inputs[i] for i in uniform_indices(len(inputs), config.frames)} | set(held)
         chosen = [label for label in files if label in kept]
@@ -107,10 +114,13 @@ class ViewsStage(Stage):
             size = {"long_side": long_side, "min_side": config.min_side}
             if from_video:
                 return load_video(
-                    first, files[first], masks.get(first), wanted,
+                    first, files[first], masks.get(first), wanted, cut_border=config.cut_sheets,
                     threads=context.threads, progress=progress, **size,
                 )  # fmt: skip
-            return load_photos(files, masks, threads=context.threads, progress=progress, **size)
+            return load_photos(
+                files, masks, cut_sheets=config.cut_sheets,
+                threads=context.threads, progress=progress, **size,
+            )  # fmt: skip
 
         if config.long_side == "auto":
             size = largest_size(wanted)
@@ -122,6 +132,7 @@ class ViewsStage(Stage):
                 everything = load(best)
         else:
             everything = load(config.long_side)
+        _tell_of_sheets(files, [item.source_name for item in everything], context.warn)
         held_names = held_labels([item.source_name for item in everything], config.held_out)
         loaded = [item for item in everything if item.source_name not in held_names]
         # the views come first: what is held out never decides which of them stays
@@ -135,6 +146,8 @@ class ViewsStage(Stage):
             named = first if from_video else " and ".join(item.source_name for item in loaded[:3])
             if len(loaded) < 2 and held_names:
                 what, named = "too much is held out", "views.held_out"
+            elif len(files) == 1 and not from_video:
+                what, named = "one photograph only", first
             raise RequestError(
                 f"{named}: {what}, and a 3D scene needs at least two different photographs, better "
                 "three or more, taken from different sides. Add some and run again."
@@ -148,7 +161,8 @@ class ViewsStage(Stage):
             if shows_nothing(item.picture):
                 context.warn(f"{item.source_name} shows almost nothing (a blank or black picture).")
         views = prepared_views(distinct)
-        ordered = from_video or is_sequence([item.source_name for item in distinct])
+        names = [item.source_name for item in distinct]
+        ordered = from_video or (set(names) <= set(files) and is_sequence(names))
         context.save(Views(views, ordered=ordered))
         if held:
             context.save(HeldOut(prepared_views(held, "h"), ordered=ordered))
@@ -158,6 +172,19 @@ class ViewsStage(Stage):
             width=max(view.width for view in views),
             height=max(view.height for view in views),
         )
+
+
+def _tell_of_sheets(
+    files: Iterable[str], names: Sequence[str], warn: Callable[[str], None]
+) -> None:
+    """Say which pictures were cut into several photographs."""
+    for label in files:
+        count = sum(name.startswith(f"{label}#") for name in names)
+        if count > 1 and not is_video(PurePath(label)):
+            warn(
+                f"{label} holds {count} photographs side by side and was cut into {label}#1 to "
+                f"#{count}. If it is one photograph, set views.cut_sheets=false."
+            )
 
 
 def _masks_by_label(sources: Mapping[str, Path], files: Mapping[str, Path]) -> dict[str, Path]:

@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.untrusted.files import UnusableFile
-from stages.views.orientation import make_upright, upright_from_stored
+from stages.views.orientation import make_stored, make_upright, upright_from_stored
 
 Mask = npt.NDArray[np.bool_]
+
+
+class Box(NamedTuple):
+    """Rows top to bottom and columns left to right of a picture, the ends not among them."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def short_side(self) -> int:
+        return min(self.bottom - self.top, self.right - self.left)
+
+    def of(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """The part of [H, W, ...]."""
+        return pixels[self.top : self.bottom, self.left : self.right]
 
 
 @dataclass(frozen=True)
@@ -40,9 +57,13 @@ def working_size(width: int, height: int, long_side: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def check_size(width: int, height: int, long_side: int, min_side: int) -> None:
-    """Raise UnusableFile where the short side would come out below `min_side`."""
-    short = min(working_size(width, height, long_side))
+def check_size(width: int, height: int, long_side: int | None, min_side: int) -> None:
+    """Raise UnusableFile where the short side would come out below `min_side`.
+
+    Args:
+        long_side: of the result; None as it is stored.
+    """
+    short = min(working_size(width, height, long_side or max(width, height)))
     if short < min_side:
         raise UnusableFile(
             f"is {width} x {height} pixels: at the working size its short side would be "
@@ -53,9 +74,9 @@ def check_size(width: int, height: int, long_side: int, min_side: int) -> None:
 
 def prepare(
     rgb: npt.NDArray[np.uint8], valid: Mask | None, orientation: int, focal_px: float | None,
-    long_side: int, given_mask: Mask | None = None,
+    long_side: int, given_mask: Mask | None = None, box: Box | None = None,
 ) -> Prepared:  # fmt: skip
-    """Resize (area-averaged, so that fine detail can't alias), then turn upright.
+    """Cut, resize (area-averaged, so that fine detail can't alias), then turn upright.
 
     Args:
         rgb: [H, W, 3] on the stored grid.
@@ -64,17 +85,29 @@ def prepare(
         focal_px: in stored pixels, or None.
         long_side: of the result, at most.
         given_mask: a mask file: upright or stored size, or either's shape at another size.
+        box: the part of the stored grid that becomes the picture; None for all.
 
     Raises:
         UnusableFile: the mask has another shape than the picture, or leaves nothing of it.
     """
     height, width = rgb.shape[:2]
-    small = working_size(width, height, long_side)
-    scale = np.diag([small[0] / width, small[1] / height, 1.0])
-    picture = make_upright(_shrink(rgb, small), orientation)
-    share = None if valid is None else make_upright(_share(valid, small), orientation)
+    whole = Box(0, 0, height, width)
+    box = whole if box is None else box
+    cut = np.array([[1.0, 0, -box.left], [0, 1, -box.top], [0, 0, 1]])
+    across, down = box.right - box.left, box.bottom - box.top
+    small = working_size(across, down, long_side)
+    scale = np.diag([small[0] / across, small[1] / down, 1.0])
+    picture = make_upright(_shrink(box.of(rgb), small), orientation)
+    share = None if valid is None else make_upright(_share(box.of(valid), small), orientation)
     if given_mask is not None:
-        given = _share(_fit_mask(given_mask, width, height, orientation), picture.shape[1::-1])
+        given_mask = _fit_mask(given_mask, width, height, orientation)
+        if box != whole:
+            full = cv2.resize(
+                make_stored(given_mask, orientation).view(np.uint8), (width, height),
+                interpolation=cv2.INTER_NEAREST,
+            )  # fmt: skip
+            given_mask = make_upright(box.of(full) > 0, orientation)
+        given = _share(given_mask, picture.shape[1::-1])
         share = given if share is None else np.minimum(share, given)
     mask = None if share is None else share >= 0.5
     if mask is not None and not mask.any():
@@ -84,7 +117,7 @@ def prepare(
     return Prepared(
         rgb=picture,
         mask=mask,
-        working_from_source=upright_from_stored(orientation, *small) @ scale,
+        working_from_source=upright_from_stored(orientation, *small) @ scale @ cut,
         source_size=(width, height),
         focal_px=None if focal_px is None else focal_px * float(scale[0, 0] + scale[1, 1]) / 2,
     )

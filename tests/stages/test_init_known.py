@@ -19,7 +19,7 @@ from pipeline.geometry.models.known_cameras import (
     read_cameras,
 )
 from pipeline.stage import LocalContext
-from stages.init.scale import mm_per_unit, working_pixel
+from stages.init.scale import mm_per_unit
 from stages.init.sfm.matching.two_view import Correspondences
 from stages.init.sfm.triangulate import (
     agreeing_matches,
@@ -308,10 +308,11 @@ def test_known_length_gives_millimetres(tmp_path):
 
 
 def test_length_that_cannot_be_measured_is_refused():
-    view = View("a", np.zeros((30, 40, 3), np.float32), source_size=(400, 300))
+    view = View("a", np.zeros((30, 40, 3), np.float32), working_from_source=np.diag([0.1, 0.1, 1]),
+                source_size=(400, 300))  # fmt: skip
     camera = Camera("a", 40, 30, 50, 50, 20, 15, np.eye(4))
     depth = np.full((30, 40), 2, np.float32)
-    np.testing.assert_allclose(working_pixel(view, (100, 50)), (10, 5))
+    np.testing.assert_allclose(view.working_place((100, 50)), (10, 5))
     # 20 working pixels at depth 2 and focal length 50 are 0.8 units.
     assert mm_per_unit(view, camera, depth, (100, 100), (300, 100), 8.0)[0] == pytest.approx(10)
     with pytest.raises(RequestError, match="outside the photograph"):

@@ -8,7 +8,7 @@ import pytest
 from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Teeth
-from pipeline.artifacts.views import View, Views
+from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init.config import DentalConfig, InitConfig
@@ -155,7 +155,9 @@ def test_a_refusal_brings_the_teeth_of_all_photographs_with_it(tmp_path, monkeyp
 
 def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):
     views = photographs()
-    large = View("000", views.views[0].image, source_name="p0.jpg", source_size=(1280, 960))
+    first = views.views[0]
+    scale = np.diag([first.width / 1280, first.height / 960, 1])
+    large = replace(first, working_from_source=scale, source_size=(1280, 960))
     views = Views((large, *views.views[1:]))
 
     def said(**hint):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -30,11 +31,11 @@ def level(index: int) -> int:
 
 def film(
     path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96),
-    coded: str = "",
+    coded: str = "", bars: int = 0,
 ) -> Path:  # fmt: skip
     """Write a film whose frame n is of brightness `level(n)`, red at the top left.
 
-    `coded` are options of x264.
+    `coded` are options of x264, `bars` the widths of black ones on the left and right.
     """
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=Fraction(25))
@@ -46,6 +47,10 @@ def film(
         for index in range(count):
             pixels = np.full((size[1], size[0], 3), level(index), np.uint8)
             pixels[:32, :48] = (250, 10, 10)
+            if bars:
+                blobs = np.random.default_rng(0).integers(0, 160, (12, 20, 3), np.uint8)
+                pixels += cv2.resize(blobs, size) // 2  # or all would be plain
+                pixels[:, :bars] = pixels[:, size[0] - bars :] = 0
             for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
                 container.mux(packet)
         for packet in stream.encode():
@@ -182,6 +187,28 @@ def test_one_mask_for_the_film(tmp_path: Path) -> None:
     views, _ = run_stage(tmp_path / "out", path, masks=tmp_path / "masks")
     for view in views.views:
         np.testing.assert_array_equal(view.mask, mask > 0)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_bars_beside_a_film_are_cut_off(tmp_path: Path, turned: bool) -> None:
+    path = film(tmp_path / "x.mp4", count=9, bars=24)
+    if turned:
+        turn_film(path, (0, 1, -1, 0))
+    mask: npt.NDArray[np.uint8] = np.zeros((96, 160), np.uint8)
+    mask[:, 80:] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "x.png")
+    settings = {"frames": 9, "min_side": 30}
+    views, _ = run_stage(tmp_path / "out", path, masks=tmp_path / "masks", **settings)
+    shape = (112, 96) if turned else (96, 112)
+    corner = (0, 24) if turned else (24, 0)
+    for view in views.views:
+        assert view.image.shape[:2] == shape
+        assert view.source_size == (160, 96)
+        np.testing.assert_allclose(view.working_place(corner), 0, atol=1e-9)
+        assert view.mask is not None and 0.4 < view.mask.mean() < 0.6
+    whole, _ = run_stage(tmp_path / "whole", path, cut_sheets=False, **settings)
+    assert {view.image.shape[:2] for view in whole.views} == {(160, 96) if turned else (96, 160)}
 
 
 def refused(folder: Path, path: Path) -> str:

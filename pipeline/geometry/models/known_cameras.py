@@ -285,13 +285,14 @@ def working_pixels_from_lens(view: View, known: KnownCamera, setting: str) -> Ar
     """[3, 3] affine map from the pixels of the model's image to the view's."""
     lens = known.lens
     width, height = view.source_size if min(view.source_size) > 0 else (view.width, view.height)
+    upright = view.upright_size
     shape = lens.width / lens.height
-    stored, upright = width / height, view.width / view.height
-    if abs(np.log(shape / stored)) < 0.02:
+    if abs(np.log(shape * height / width)) < 0.02:
         scale = np.diag([width / lens.width, height / lens.height, 1.0])
         return np.asarray(view.working_from_source @ scale)
-    if abs(np.log(shape / upright)) < 0.02:
-        return np.diag([view.width / lens.width, view.height / lens.height, 1.0])
+    if abs(np.log(shape * upright[1] / upright[0])) < 0.02:
+        scale = np.diag([upright[0] / lens.width, upright[1] / lens.height, 1.0])
+        return np.asarray(view.working_from_upright @ scale)
     raise RequestError(
         f"{setting}: the camera of {known.name} is for an image of {lens.width} x {lens.height} "
         f"pixels, but the photograph {view.source_name or view.name} has {width} x {height}. Give "

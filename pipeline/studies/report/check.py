@@ -101,13 +101,14 @@ def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrectio
     shown = picture(
         to_uint8(view.image), label, long_side=LARGE if seen.all_crowns else SMALL
     )  # fmt: skip
-    upright = view.upright_size
+    upright_from_shown = np.linalg.inv(view.working_from_upright)
     return {
         "name": label,
         "picture": shown.uri,
         "width": view.width,
         "height": view.height,
-        "scale": [upright[0] / view.width, upright[1] / view.height],
+        "scale": upright_from_shown.diagonal()[:2].tolist(),
+        "corner": upright_from_shown[:2, 2].tolist(),
         "mirrored": bool(seen.mirrored),
         "roll": round(float(seen.roll), 4),
         "kind": seen.kind,

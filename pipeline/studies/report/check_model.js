@@ -158,8 +158,9 @@ const place = (point) => `[${point.map((value) => Math.round(value * 10) / 10).j
 // Pixels of the picture as shown, which may be turned over, and of the photograph as it was taken.
 const turnedOver = (photo, [x, y]) => [photo.mirrored ? photo.width - x : x, y];
 const original = (photo, point) =>
-  turnedOver(photo, point).map((value, axis) => value * photo.scale[axis]);
-const shownAt = (photo, at) => turnedOver(photo, at.map((value, axis) => value / photo.scale[axis]));
+  turnedOver(photo, point).map((value, axis) => value * photo.scale[axis] + photo.corner[axis]);
+const shownAt = (photo, at) => turnedOver(photo,
+  at.map((value, axis) => (value - photo.corner[axis]) / photo.scale[axis]));
 // What is said of a picture shown turned over is said of a mirror image.
 const mirroredOf = (photo) => photo.mirroredSaid ?? (photo.mirrored
   && (photo.kindSaid !== null || photo.entries.some((entry) => entry.tooth)) ? true : null);
