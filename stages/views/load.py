@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, read
 from stages.views.reading.apart import Decoder
-from stages.views.reading.video import VideoFrame, map_frames
+from stages.views.reading.video import VideoFrame, Wanted, map_frames
 from stages.views.sheets import photographs_in
 from stages.views.working import Box, Mask, Prepared, check_size, prepare
 
@@ -107,10 +108,10 @@ def load_photos(
 
 
 def load_video(
-    label: str, path: Path, mask: Path | None, frames: int, long_side: int, min_side: int,
+    label: str, path: Path, mask: Path | None, wanted: Wanted, long_side: int, min_side: int,
     cut_border: bool = True, threads: int = 1, progress: Progress = lambda done, total: None,
 ) -> list[Loaded]:  # fmt: skip
-    """Load uniformly chosen frames of a video; a mask serves for all of them.
+    """Load evenly chosen frames of a video; a mask serves for all of them.
 
     Args:
         cut_border: cut off what most frames have around them, such as the bars beside a film that
@@ -125,6 +126,9 @@ def load_video(
         picture = prepare(frame.rgb, None, frame.orientation, None, long_side, given, box)
         return frame.index, frame.seconds, picture, within
 
+    def frames_of(file: BinaryIO) -> list[tuple[int, float, Prepared, list[Box]]]:
+        return map_frames(file, prepared, wanted, threads, progress, check)
+
     box: Box | None = None
     try:
         check = partial(check_size, long_side=long_side, min_side=min_side)
@@ -133,12 +137,12 @@ def load_video(
             with Decoder() as decoder:
                 given = _read_mask(mask, decoder)
         with opened(path, FILM) as file:
-            found = map_frames(file, prepared, frames, threads, progress, check)
+            found = frames_of(file)
             if cut_border:
                 box = _common_border([entry[2] for entry in found], [entry[3] for entry in found])
             if box is not None:
                 file.seek(0)
-                found = map_frames(file, prepared, frames, threads, progress, check)
+                found = frames_of(file)
             file.seek(0)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         return [

@@ -28,8 +28,12 @@ class ViewsConfig(StageConfig):
     )
     frames: int | None = Field(
         None, ge=2, le=1000,
-        description="use this many, uniformly sampled; default: all photographs, 24 of a video",
+        description="use this many, evenly sampled; default: all photographs, 24 of a video",
     )  # fmt: skip
+    sampling: Literal["difference", "time"] = Field(
+        "difference",
+        description="frames of a video are spread evenly by how much they differ, or in time",
+    )
     min_side: int = Field(
         64, ge=16, le=4096,
         description="refuse photographs whose short side is less than this at working size",
@@ -42,7 +46,7 @@ class ViewsConfig(StageConfig):
     held_out: tuple[str, ...] = Field(
         (),
         description="photographs to test with: file names or stems among those given (of a video: "
-        "film.mp4#12); no stage but evaluate sees them",
+        "film.mp4#12, any frame); no stage but evaluate sees them",
     )
     deduplicate: bool = Field(True, description="leave out photographs that are there twice")
     cut_sheets: bool = Field(
@@ -97,6 +101,7 @@ class ViewsStage(Stage):
             prepared_views,
             shows_nothing,
         )
+        from stages.views.reading.video import Wanted
         from stages.views.sharpness import best_size, largest_size
 
         config: ViewsConfig = context.config
@@ -110,11 +115,13 @@ class ViewsStage(Stage):
         from_video = is_video(PurePath(first))
         wanted = (config.frames or FRAMES_OF_A_VIDEO) if from_video else len(files)
 
+        frames = Wanted(wanted, config.sampling == "difference", _frame_numbers(first, config))
+
         def load(long_side: int) -> list[Loaded]:
             size = {"long_side": long_side, "min_side": config.min_side}
             if from_video:
                 return load_video(
-                    first, files[first], masks.get(first), wanted, cut_border=config.cut_sheets,
+                    first, files[first], masks.get(first), frames, cut_border=config.cut_sheets,
                     threads=context.threads, progress=progress, **size,
                 )  # fmt: skip
             return load_photos(
@@ -172,6 +179,13 @@ class ViewsStage(Stage):
             width=max(view.width for view in views),
             height=max(view.height for view in views),
         )
+
+
+def _frame_numbers(film: str, config: ViewsConfig) -> frozenset[int]:
+    """Numbers of the frames of a film that are held out."""
+    named = (name.rpartition("#") for name in config.held_out)
+    numbers = [number for label, _, number in named if label == film and number.isdecimal()]
+    return frozenset(map(int, numbers))
 
 
 def _tell_of_sheets(

@@ -17,8 +17,9 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.films import reader_for
+from stages.views.reading.video import VideoFrame
 from stages.views.stage import ViewsConfig, ViewsStage
-from tests.films import read_frames
+from tests.films import read_frames as read_some_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 BRIGHT = 200
@@ -54,6 +55,11 @@ def refused(path: Path) -> str:
         ViewsStage().run(context)
     assert path.name in str(caught.value)
     return str(caught.value)
+
+
+def read_frames(path: Path, wanted: int) -> list[VideoFrame]:
+    """With glances all over the film first."""
+    return read_some_frames(path, wanted, by_difference=True)
 
 
 @pytest.mark.parametrize(

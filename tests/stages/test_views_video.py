@@ -17,7 +17,7 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from pipeline.untrusted.files import FILM, opened
 from stages.views.load import load_video
-from stages.views.reading.video import map_frames
+from stages.views.reading.video import Wanted, map_frames
 from stages.views.stage import ViewsConfig, ViewsStage
 from tests.films import read_frames
 
@@ -107,7 +107,9 @@ def test_frames_are_the_same_where_not_all_are_decoded(
     every = read_frames(path, 35)
     decoded: set[int] = set()
     with opened(path, FILM) as file:
-        chosen = map_frames(file, lambda frame: frame, 3, 1, lambda done, _: decoded.add(done))
+        chosen = map_frames(
+            file, lambda frame: frame, Wanted(3), 1, lambda done, _: decoded.add(done)
+        )
     assert [frame.index for frame in chosen] == [0, 17, 34]
     assert indices_by_brightness(chosen) == [0, 17, 34]
     for frame in chosen:
@@ -153,7 +155,9 @@ def test_stage_on_a_film(tmp_path: Path) -> None:
     views, _ = run_stage(tmp_path / "a", path)
     assert len(views) == 24
     assert views.ordered
-    views, context = run_stage(tmp_path / "b", path, frames=3, long_side=80, min_side=30)
+    views, context = run_stage(
+        tmp_path / "b", path, frames=3, sampling="time", long_side=80, min_side=30
+    )
     assert [view.source_name for view in views.views] == [
         "my film.mp4#0", "my film.mp4#14", "my film.mp4#29",
     ]  # fmt: skip

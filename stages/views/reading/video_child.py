@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
@@ -21,6 +21,10 @@ from stages.views.sampling import uniform_indices
 
 #: Readers of films that hold an index of their frames.
 WITH_INDEX = ("mov", "matroska")
+#: Pixels of the long side of a glance.
+GLANCE = 64
+#: Frames to glance at for each that is wanted, at most, and key frames, at least.
+GLANCES, FEWEST_KEYS = 8, 0.75
 
 for _module in pkgutil.walk_packages(av.__path__, "av."):  # it imports most of them when used
     if not _module.name.endswith((".__main__", ".datasets")):
@@ -43,33 +47,49 @@ class _Contents:
 
 
 def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
-    """Frames of the film behind an open descriptor.
+    """Frames of the film behind an open descriptor: these ``indices``, or ``wanted`` uniform ones,
+    and ``also`` others.
 
     The packets are counted first. Then each frame is decoded from the key frame before it, or,
     where packets don't tell these, the whole film once. If the film is not as its packets say
     (damaged, or cut without re-encoding) ``again`` comes, and the frames before it don't count.
+
+    Or, if asked to ``glance`` at ``keys`` or ``all``, small grey pictures of more of them; none of
+    a film of no more frames than are wanted.
     """
-    with os.fdopen(int(values["file"]), "rb") as file:
+    with os.fdopen(int(values["file"]), "rb", closefd=False) as file:
         try:
             contents = yield from _contents(file)
             count = contents.count
             if count == 0:
                 raise UnusableFile("has no video frames in it")
             wanted, threads = int(values["wanted"]), int(values["threads"])
-            indices = uniform_indices(count, wanted)
+            if values.get("glance"):
+                if count > wanted:
+                    by_keys = values["glance"] == "keys"
+                    yield from _glance(file, wanted, contents, threads, by_keys)
+                return
             if contents.keys:
+                indices = _indices(values, count)
                 if (yield from _decode_from_keys(file, indices, contents, threads)):
                     return
                 yield {"again": True}, []
-            found = yield from _decode(file, indices, count, threads)
+            found = yield from _decode(file, _indices(values, count), count, threads)
             if found not in (0, count):
                 yield {"again": True}, []
-                yield from _decode(file, uniform_indices(found, wanted), found, threads)
+                yield from _decode(file, _indices(values, found), found, threads)
         except MemoryError:
             raise
         except (av.error.FFmpegError, OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise UnusableFile(f"can't be read as a video ({reason})") from error
+
+
+def _indices(values: Values, count: int) -> list[int]:
+    """Numbers of the frames to take of a film that has so many."""
+    given = [int(index) for index in values["indices"]]
+    spread = given if given and given[-1] < count else uniform_indices(count, int(values["wanted"]))
+    return sorted({*spread, *(index for index in values["also"] if 0 <= index < count)})
 
 
 def _contents(file: BinaryIO) -> Generator[Reply, None, _Contents]:
@@ -124,6 +144,44 @@ def _reply(index: int, frame: Any, start: float) -> Reply:
     turn = orientation_from_rotation(frame.rotation)
     values = {"index": index, "orientation": turn, "seconds": round(float(seconds), 6)}
     return values, [np.ascontiguousarray(frame.to_ndarray(format="rgb24"))]
+
+
+def _glance(
+    file: BinaryIO, wanted: int, contents: _Contents, threads: int, by_keys: bool
+) -> Iterator[Reply]:
+    """Small grey pictures of frames all over the film, with the number of each.
+
+    Args:
+        by_keys: of key frames; none where these are unknown or too few to tell anything.
+    """
+    count, shown = contents.count, contents.shown
+    places = contents.keys if by_keys else range(count)
+    if by_keys and len(places) < FEWEST_KEYS * wanted:
+        return
+    awaited = [places[k] for k in uniform_indices(len(places), GLANCES * wanted)]
+    with opened_film(file) as container:
+        stream = _opened(container, threads)
+        if shown:  # frames that no other needs are left out: one that is awaited is then late
+            stream.codec_context.skip_frame = "NONKEY" if by_keys else "NONREF"
+        frames = enumerate(container.decode(stream))
+        while True:
+            try:
+                number, frame = next(frames)
+            except StopIteration:
+                return
+            except av.error.FFmpegError:  # the frames that are wanted may be sound all the same
+                yield {"damaged": True}, []
+                return
+            at = bisect_left(shown, frame.pts) if shown and frame.pts is not None else number
+            check_size(frame.width, frame.height)
+            if awaited and at >= awaited[0]:
+                del awaited[: bisect_right(awaited, at)]
+                scale = GLANCE / max(frame.width, frame.height)
+                width, height = (max(1, round(n * scale)) for n in (frame.width, frame.height))
+                small = frame.reformat(width, height, "gray", interpolation="AREA")
+                yield {"index": at, "of": count}, [small.to_ndarray()]
+            elif number % 10 == 0:
+                yield {"counted": number}, []
 
 
 def _decode_from_keys(
