@@ -22,14 +22,15 @@ LEVELS = 16
 PLAIN = 0.97
 #: lines of a band between photographs, at least: a single one is a hair or a scratch
 BAND = 2
-#: Least share of a photograph's rim that differs from the band beside it. Twelve triads on 180
-#: sheets (rows, columns, pyramids, slides with a title; bands of 2 to 20 pixels; three JPEG
-#: qualities) have .7 or more but where the photograph itself ends in plain black or white; of 810
-#: photographs of teeth and houses that are one none has two parts above .23.
+#: Least share of a photograph's rim that differs from the bands beside it, all sides together:
+#: those of twelve triads on 360 sheets have more (`benchmarks/sheets.py`) but where the photograph
+#: itself ends in plain black or white. Of 810 photographs of teeth and houses none has two parts
+#: above .23.
 RIM = 0.6
-#: The same for a border around one photograph: 15 of 698 that were found in the web have one, with
-#: .84 or more; those without have .6 at most.
-BORDER = 0.8
+#: The same of each side for a border around one photograph, and the share of the border that may be
+#: of another colour. Of 698 that were found in the web 17 have a border, 15 of them with .93 or
+#: more, 10 of these of one colour; others have .77 at most, and .72 where the sky ends.
+BORDER, OTHER = 0.9, 0.1
 #: Where the rim is looked at, as a share of the photograph's short side: scaled and compressed
 #: pictures begin softly.
 INSIDE = 0.004
@@ -58,8 +59,8 @@ def photographs_in(rgb: Bytes, *, touching: bool = False) -> list[Box]:
     whole = Box(0, 0, *rgb.shape[:2])
     parts = _parts(rgb, whole, touching)
     if len(parts) == 1:
-        return parts if _rim(rgb, parts[0]) >= BORDER else [whole]
-    if sum(_rim(rgb, part) >= RIM for part in parts) < 2:
+        return parts if _has_border(rgb, parts[0]) else [whole]
+    if sum(np.mean(_rim(rgb, part)) >= RIM for part in parts) < 2:
         return [whole]
     if not touching:  # a narrow band that JPEG has spoiled is still a seam
         parts = _parts(rgb, whole, True)
@@ -86,8 +87,8 @@ def _parts(
             parts = _parts(rgb, piece, touching, depth + 1)
             if found and found[-1][1] and parts and not by_seams:
                 before, earlier = found[-1]
-                rims = [_side(rgb, part, axis, 1) for part in earlier]
-                rims += [_side(rgb, part, axis, 0) for part in parts]
+                rims = [_side(rgb, part, axis, 1) or 0 for part in earlier]
+                rims += [_side(rgb, part, axis, 0) or 0 for part in parts]
                 if max(rims) < RIM:  # a plain stretch of one photograph
                     found.pop()
                     piece = Box(before.top, before.left, piece.bottom, piece.right)
@@ -124,11 +125,18 @@ def _plain_lines(pixels: Bytes) -> npt.NDArray[np.bool_]:
 
 
 def _plainness(pixels: Bytes, samples: int) -> Floats:
-    """[N] share of each line [N, M, 3] that has its colour, by so many of its pixels."""
+    """[N] share of each line [N, M, 3] that has its colour, by so many of its pixels.
+
+    The colour may change evenly along the line, as on the slides of a presentation.
+    """
     step = max(1, pixels.shape[1] // samples)
-    some = pixels[:, step // 2 :: step].astype(np.int16)
-    colour = np.median(some, axis=1, keepdims=True)
-    return np.asarray((np.abs(some - colour).max(-1) <= LEVELS).mean(1, dtype=np.float32))
+    some = pixels[:, step // 2 :: step].astype(np.float32)
+    half = some.shape[1] // 2
+    start, end = (np.median(part, axis=1)[:, None] for part in (some[:, :half], some[:, half:]))
+    along = (np.arange(some.shape[1], dtype=np.float32) + 0.5)[:, None] / some.shape[1]
+    colours = np.median(some, axis=1)[:, None], start + (end - start) * (2 * along - 0.5)
+    near = [np.abs(some - colour).max(-1) <= LEVELS for colour in colours]
+    return np.max([each.mean(1, dtype=np.float32) for each in near], axis=0)
 
 
 def _between_seams(pixels: Bytes) -> list[tuple[int, int]]:
@@ -149,14 +157,25 @@ def _between_seams(pixels: Bytes) -> list[tuple[int, int]]:
     return pieces
 
 
-def _rim(rgb: Bytes, box: Box) -> float:
-    """Least share of a side of the box that differs from the line outside; 1 without such sides."""
-    return min(_side(rgb, box, axis, end) for axis in (0, 1) for end in (0, 1))
+def _has_border(rgb: Bytes, box: Box) -> bool:
+    """Is all around the box of one colour, and its rim straight? A sky is neither."""
+    around = (rgb[: box.top], rgb[box.bottom :], rgb[:, : box.left], rgb[:, box.right :])
+    for strip in around:
+        some = strip[:: max(1, len(strip) // MANY), :: max(1, strip.shape[1] // MANY)]
+        if some.size and _differing(some.reshape(-1, 3), some.reshape(-1, 3)) > OTHER:
+            return False
+    return min(_rim(rgb, box)) >= BORDER
 
 
-def _side(rgb: Bytes, box: Box, axis: int, end: int) -> float:
+def _rim(rgb: Bytes, box: Box) -> list[float]:
+    """`_side` of each side of the box that the picture does not have; 1 where it has all."""
+    sides = [_side(rgb, box, axis, end) for axis in (0, 1) for end in (0, 1)]
+    return [share for share in sides if share is not None] or [1.0]
+
+
+def _side(rgb: Bytes, box: Box, axis: int, end: int) -> float | None:
     """Share of the first (0) or last (1) line of the box across an axis that differs from the line
-    outside; 1 where the picture ends."""
+    outside; None where the picture ends."""
     across = slice(box.left, box.right) if axis == 0 else slice(box.top, box.bottom)
     lines = rgb[:, across] if axis == 0 else rgb[across].swapaxes(0, 1)
     inside = max(2, round(INSIDE * box.short_side))
@@ -167,7 +186,7 @@ def _side(rgb: Bytes, box: Box, axis: int, end: int) -> float:
         outside = box[axis + 2]
         line = box[axis + 2] - 1 - inside
     if not 0 <= outside < len(lines):
-        return 1.0
+        return None
     return _differing(lines[line], lines[outside])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -77,6 +78,21 @@ def test_a_slide_with_words_and_a_logo() -> None:
     assert photographs_in(pixels) == boxes
 
 
+def test_photographs_with_shadows() -> None:
+    places = [(20, 20), (260, 20), (500, 20)]
+    shadows = np.zeros((200, 740), np.float32)
+    for left, top in places:
+        shadows[top + 6 : top + 156, left + 6 : left + 206] = 0.4
+    shaded = 255 * (1 - cv2.GaussianBlur(shadows, (0, 0), 4))
+    pixels = np.repeat(shaded.astype(np.uint8)[..., None], 3, 2)
+    for seed, (left, top) in enumerate(places):
+        pixels[top : top + 150, left : left + 200] = photograph(seed)
+    found = photographs_in(as_jpeg(pixels, 85))
+    assert len(found) == 3
+    for box, (left, top) in zip(found, places, strict=True):
+        np.testing.assert_allclose(box, (top, left, top + 150, left + 200), atol=16)
+
+
 def test_photographs_that_touch_are_cut_where_they_are_looked_for() -> None:
     pixels = as_jpeg(sheet([(0, 0), (200, 0), (400, 0)], (600, 150), WHITE), 80)
     whole = [(0, 0, 150, 600)]
@@ -90,6 +106,15 @@ def test_photographs_that_touch_are_cut_where_they_are_looked_for() -> None:
 def test_a_border_is_cut_off() -> None:
     assert photographs_in(sheet([(30, 12)], (260, 170), BLACK)) == [(12, 30, 162, 230)]
     assert photographs_in(sheet([(0, 40)], (200, 230), WHITE)) == [(40, 0, 190, 200)]
+
+
+def test_a_sky_above_a_straight_roof_is_no_border() -> None:
+    pixels = np.vstack([np.zeros((100, 200, 3), np.uint8), photograph(2)])
+    sky = np.linspace(120, 240, 100).astype(np.uint8)
+    pixels[:100] = sky[:, None, None]
+    assert photographs_in(pixels) == [(0, 0, 250, 200)]
+    pixels[:100] = 120
+    assert photographs_in(pixels) == [(100, 0, 250, 200)]
 
 
 def test_things_before_a_plain_wall_are_one_photograph() -> None:
