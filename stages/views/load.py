@@ -74,8 +74,10 @@ def load_photos(
             boxes = [whole]
             if cut_sheets:
                 boxes = photographs_in(photo.rgb, touching=len(files) == 1)
-            for box in boxes:
-                fits(box.right - box.left, box.bottom - box.top)
+            if len(boxes) > 1:  # a banner across a sheet is left out
+                boxes = [box for box in boxes if _fitting(box, fits)] or [whole]
+            if len(boxes) == 1:
+                fits(boxes[0].right - boxes[0].left, boxes[0].bottom - boxes[0].top)
             focal = photo.focal_px if len(boxes) == 1 else None
             pictures = [
                 prepare(photo.rgb, photo.valid, photo.orientation, focal, long_side, mask, box)
@@ -156,6 +158,14 @@ def load_video(
         ) from error
 
 
+def _fitting(box: Box, check: Callable[[int, int], None]) -> bool:
+    try:
+        check(box.right - box.left, box.bottom - box.top)
+    except UnusableFile:
+        return False
+    return True
+
+
 def _common_border(pictures: Sequence[Prepared], parts: Sequence[Sequence[Box]]) -> Box | None:
     """What most frames of a film are within; None where that is all of them.
 
@@ -163,7 +173,9 @@ def _common_border(pictures: Sequence[Prepared], parts: Sequence[Sequence[Box]])
         pictures: the frames.
         parts: of each, the photographs in it.
     """
-    width, height = pictures[0].source_size
+    (width, height), *others = {picture.source_size for picture in pictures}
+    if others:
+        return None
     whole = Box(0, 0, height, width)
     boxes = [found[0] if len(found) == 1 else whole for found in parts]
     common = Box(*np.median(boxes, axis=0).astype(int).tolist())

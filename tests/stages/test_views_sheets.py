@@ -206,6 +206,14 @@ def test_a_photograph_of_a_sheet_may_be_held_out(tmp_path: Path) -> None:
         run_stage(tmp_path / "none", tmp_path / "in", held_out=("sheet.png#7",))
 
 
+def test_a_banner_is_left_out(tmp_path: Path) -> None:
+    pixels = sheet([(10, 100), (220, 100), (430, 100)], (640, 270), WHITE)
+    pixels[10:80, 10:630] = cv2.resize(photograph(5), (620, 70))
+    write(tmp_path / "in" / "sheet.png", pixels)
+    views: Views = run_stage(tmp_path / "out", tmp_path / "in", min_side=40).result("views")
+    assert [view.image.shape[:2] for view in views.views] == [(75, 100)] * 3
+
+
 def test_six_photographs_of_a_sheet_are_no_film(tmp_path: Path) -> None:
     places = [(left, top) for top in (0, 160) for left in (0, 210, 420)]
     write(tmp_path / "in" / "sheet.png", sheet(places, (620, 310), BLACK))
