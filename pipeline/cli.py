@@ -91,7 +91,7 @@ def run_command(
     stages: Stages = None,
     overrides: Overrides = None,
     frames: Annotated[
-        int | None, typer.Option("--frames", help="Use this many, uniformly sampled.")
+        int | None, typer.Option("--frames", help="Use this many, evenly sampled.")
     ] = None,
     from_stage: Annotated[
         str | None,

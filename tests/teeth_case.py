@@ -48,13 +48,16 @@ def dentition(
     return dentition_of(outlines, name, (WIDTH, HEIGHT), kind, roll=0.0)
 
 
-def views(names: Sequence[str] = NAMES) -> Views:
+def views(names: Sequence[str] = NAMES, corner: tuple[int, int] = (0, 0)) -> Views:
+    """The photographs; with a corner (x, y), each is cut out of a larger picture there."""
+    cut = np.array([[1.0, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]])
+    size = SCALE * WIDTH + 2 * corner[0], SCALE * HEIGHT + 2 * corner[1]
     shade = np.linspace(0.2, 0.8, WIDTH, dtype=np.float32)
     image = np.broadcast_to(shade[None, :, None], (HEIGHT, WIDTH, 3)).copy()
     return Views(
         tuple(
-            View(f"{k:03d}", image, working_from_source=np.diag([1 / SCALE, 1 / SCALE, 1.0]),
-                 source_size=(SCALE * WIDTH, SCALE * HEIGHT), source_name=name)
+            View(f"{k:03d}", image, working_from_source=np.diag([1 / SCALE, 1 / SCALE, 1.0]) @ cut,
+                 source_size=size, source_name=name)
             for k, name in enumerate(names)
         )
     )  # fmt: skip

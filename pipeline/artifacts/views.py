@@ -26,7 +26,8 @@ class View:
         working_from_source: [3, 3] float64 affine map of pixel coordinates (centres at .5) from the
             stored pixel grid of the source file (before EXIF orientation) to `image`.
         source_size: (width, height) of that grid.
-        source_name: file name, or ``video.mp4#123``. Stays in the workspace, never exported.
+        source_name: file name, ``video.mp4#123``, or ``sheet.jpg#1`` for the first of several
+            photographs in a picture. Stays in the workspace, never exported.
         source_sha256: of the source file's bytes.
         focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
         timestamp: seconds from the start of the video, or None.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -128,8 +128,8 @@ def load_video(
         picture = prepare(frame.rgb, None, frame.orientation, None, long_side, given, box)
         return frame.index, frame.seconds, picture, within
 
-    def frames_of(file: BinaryIO) -> list[tuple[int, float, Prepared, list[Box]]]:
-        return map_frames(file, prepared, wanted, threads, progress, check)
+    def frames_of(file: BinaryIO, of: Wanted) -> list[tuple[int, float, Prepared, list[Box]]]:
+        return map_frames(file, prepared, of, threads, progress, check)
 
     box: Box | None = None
     try:
@@ -139,12 +139,13 @@ def load_video(
             with Decoder() as decoder:
                 given = _read_mask(mask, decoder)
         with opened(path, FILM) as file:
-            found = frames_of(file)
+            found = frames_of(file, wanted)
             if cut_border:
                 box = _common_border([entry[2] for entry in found], [entry[3] for entry in found])
             if box is not None:
                 file.seek(0)
-                found = frames_of(file)
+                known = tuple(entry[0] for entry in found)
+                found = frames_of(file, replace(wanted, indices=known))
             file.seek(0)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         return [

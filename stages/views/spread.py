@@ -89,6 +89,11 @@ def spread_indices(places: Sequence[int], apart: Floats, count: int, wanted: int
 
 
 def _by_limit(places: Sequence[int], apart: Floats, limit: float, even: float) -> list[int]:
+    """[M] numbers of glances, each of which differs by the limit from the one before it.
+
+    Args:
+        even: frames from one to the next if they were even in time.
+    """
     chosen = [0]
     for k in range(1, len(places) - 1):
         passed = places[k] - places[chosen[-1]]

@@ -114,7 +114,6 @@ class ViewsStage(Stage):
         first = next(iter(files))
         from_video = is_video(PurePath(first))
         wanted = (config.frames or FRAMES_OF_A_VIDEO) if from_video else len(files)
-
         frames = Wanted(wanted, config.sampling == "difference", _frame_numbers(first, config))
 
         def load(long_side: int) -> list[Loaded]:

@@ -24,13 +24,16 @@ from tests.studies.report_case import write_result
 from tests.studies.report_page import assert_alone, text_of
 
 
-def doubtful_case(folder: Path, teeth: Teeth | None = None, failure: str = "Doubtful.") -> Path:
+def doubtful_case(
+    folder: Path, teeth: Teeth | None = None, failure: str = "Doubtful.",
+    corner: tuple[int, int] = (0, 0),
+) -> Path:  # fmt: skip
     """A workspace in which init found teeth, but no safe result."""
     folder.mkdir()
     request = {"images": ["/photos"], "preset": None, "overrides": ["fit.iterations=20"],
                "stages": ["views", "init"], "from": None}  # fmt: skip
     (folder / "request.json").write_text(json.dumps(request))
-    write_result(folder, "views", [case.views()])
+    write_result(folder, "views", [case.views(corner=corner)])
     store = Store(folder)
     store.failures.keep("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
     store.failures.record("init", "key", failure)
@@ -196,8 +199,10 @@ def probed(workspace: Path, folder: Path, *script: str) -> dict[str, Any]:
 
 
 @needs_chromium
-def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
-    workspace = doubtful_case(tmp_path / "a case")
+@pytest.mark.parametrize("corner", [(0, 0), (30, 20)])
+def test_everything_can_be_put_right_in_a_browser(tmp_path: Path, corner: tuple[int, int]) -> None:
+    """Also where photographs are cut out of a sheet: places are those in the sheet."""
+    workspace = doubtful_case(tmp_path / "a case", corner=corner)
     result = probed(workspace, tmp_path / "browser", PROBE, SAVE, SAVED)
     assert result["cards"] == 2 + 3
     assert result["left"] == ["2_<left>.jpgit is <b>blurred</b>Use it"]
@@ -221,7 +226,7 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path) -> None:
     )
 
     corrections = read_corrections(case.write(workspace / "teeth.yaml", result["yaml"]))
-    after = apply_corrections(case.teeth("x"), case.views(), corrections).views
+    after = apply_corrections(case.teeth("x"), case.views(corner=corner), corrections).views
     rows = [[crown.number for crown in view.all_crowns] for view in after]
     assert rows[0] == [53, 12, 11, 21, 22, 23, 43, 42, 31, 32, 33]
     assert rows[1] == [13, 12, 11, 21, 22, 23, 24, *case.LOWER]

@@ -48,11 +48,13 @@ class Wanted:
         count: how many, all if the film has fewer; the first and the last, or nearly, among them.
         by_difference: spread evenly by how much they differ (`spread_indices`), or by number.
         also: numbers of frames that are taken as well, where the film has them.
+        indices: numbers of the frames, rising, where these are known.
     """
 
     count: int
     by_difference: bool = False
     also: frozenset[int] = frozenset()
+    indices: tuple[int, ...] = ()
 
 
 def map_frames(
@@ -80,13 +82,13 @@ def map_frames(
     """
     descriptor = file.fileno()
     request: dict[str, Any] = {
-        "file": descriptor, "wanted": wanted.count, "also": sorted(wanted.also), "indices": [],
-        "threads": min(threads, MOST_THREADS),
+        "file": descriptor, "wanted": wanted.count, "also": sorted(wanted.also),
+        "indices": list(wanted.indices), "threads": min(threads, MOST_THREADS),
     }  # fmt: skip
     limit = seconds_for(os.fstat(descriptor).st_size)
     made: list[Used] = []
     with Child("stages.views.reading.video_child:work", MOST_MEMORY, [descriptor]) as child:
-        if wanted.by_difference:
+        if wanted.by_difference and not wanted.indices:
             request["indices"] = _chosen(child, request, limit, wanted.count, progress)
         for reply, arrays in child.ask(request, [], limit):
             if "size" in reply:
