@@ -61,10 +61,7 @@ class ExportStage(Stage):
         from pipeline.artifacts.space.frames import frame_of
         from pipeline.artifacts.space.scale import NO_SCALE
         from stages.export.beside import Beside
-        from stages.export.mesh.building import build_mesh
-        from stages.export.mesh.jaws import crown_maps, jaws_of
-        from stages.export.mesh.rims import even_border
-        from stages.export.mesh.texture.sight import sights
+        from stages.export.mesh.building import raw_surface
         from stages.export.scene import assemble
         from stages.export.splatfiles.writing import write_splats
 
@@ -95,52 +92,31 @@ class ExportStage(Stage):
             "gaussians": len(scene.gaussians),
         }
         skipped: dict[str, str] = {}
-        mouth, teeth, mesh, page, model_points = None, None, None, None, None
-        with Beside(context.threads) as beside:
-            beside.give(write_splats, folder, scene, frame.stands, comments, config.splat_files)
+        mouth, teeth, raw, model_points = None, None, None, None
+        with Beside(context.threads) as files, Beside(context.threads) as surface:
+            files.give(write_splats, folder, scene, frame.stands, comments, config.splat_files)
             if config.colmap:
                 import pycolmap  # noqa: F401  only in this thread can signals wait meanwhile
 
-                model_points = beside.give(_write_cameras, context, scene, folder, scale)
+                model_points = files.give(_write_cameras, context, scene, folder, scale)
             if context.has("teeth"):
                 mouth, teeth = _write_teeth(context, views, scene, folder, frame, scale)
             if config.mesh:
-                mesh = build_mesh(
+                raw = raw_surface(
                     scene, config.mesh_method, config.mesh_resolution, config.mesh_cell,
-                    config.mesh_views, config.mesh_depth, config.mesh_confidence,
-                    config.mesh_faces, context.progress,
+                    config.mesh_views, config.mesh_depth, config.mesh_confidence, context.progress,
                 )  # fmt: skip
                 context.progress("mesh", 1, 1)
-            seen: Sequence[Sight] = ()
-            jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
-            if mesh is not None:
-                seen = sights(mesh, scene.cameras, scene.masks)
-                if mouth is not None:
-                    jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
-                if jaws:
-                    mesh = even_border(mesh, jaws["upper"])
-                    seen = sights(mesh, scene.cameras, scene.masks)
-            if config.viewer:
-                known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)
-                page = beside.give(_write_page, context, scene, folder, known)
-            if mesh is not None:
-                beside.give(
-                    _write_mesh, context, cameras, scene, mesh, seen, jaws, folder, frame, scale,
-                    skipped,
-                )  # fmt: skip
-            elif config.mesh:
-                skipped["mesh"] = "too little surface for a mesh"
-                context.warn(
-                    "No mesh was made: too little of the surface is known. More photographs that "
-                    "overlap would help; the other exports are complete."
-                )
-            if config.preview:
-                beside.give(_write_preview, scene, mesh, folder)
+            finished = surface.give(
+                _finish_surface, context, cameras, scene, raw, mouth, teeth, folder, frame, scale,
+                skipped,
+            )  # fmt: skip
             frames = _write_video(context, scene, folder) if config.video else None
+        mesh_faces, page_bytes = finished()
         made = {
             "colmap_points": model_points() if model_points else None,
             "teeth": len(teeth["teeth"]) if teeth else None,
-            "mesh_faces": len(mesh) if mesh is not None else None,
+            "mesh_faces": mesh_faces,
             "video_frames": frames,
         }
         counts |= {name: count for name, count in made.items() if count is not None}
@@ -148,8 +124,51 @@ class ExportStage(Stage):
         context.summarize(
             splats=len(scene.gaussians),
             mesh_faces=counts.get("mesh_faces", 0),
-            page_mb=round(page() / 1e6, 2) if page else 0,
+            page_mb=round(page_bytes / 1e6, 2),
         )
+
+
+def _finish_surface(
+    context: StageContext, cameras: Cameras, scene: Scene, raw: Mesh | None, mouth: Mouth | None,
+    teeth: dict[str, Any] | None, folder: Path, frame: Frame, scale: Scale,
+    skipped: dict[str, str],
+) -> tuple[int | None, int]:  # fmt: skip
+    """From the surface as it comes to the mesh, and to all files that rest on it.
+
+    Returns:
+        Triangles of the mesh, None where there is none; bytes of the viewer page, 0 without one.
+    """
+    from stages.export.mesh.building import clean_mesh
+    from stages.export.mesh.jaws import crown_maps, jaws_of
+    from stages.export.mesh.rims import even_border
+    from stages.export.mesh.texture.sight import sights
+
+    config: ExportConfig = context.config
+    mesh = clean_mesh(raw, config.mesh_faces) if raw is not None else None
+    seen: Sequence[Sight] = ()
+    jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
+    if mesh is not None:
+        seen = sights(mesh, scene.cameras, scene.masks)
+        if mouth is not None:
+            jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
+        if jaws:
+            mesh = even_border(mesh, jaws["upper"])
+            seen = sights(mesh, scene.cameras, scene.masks)
+    page_bytes = 0
+    if config.viewer:
+        known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)
+        page_bytes = _write_page(context, scene, folder, known)
+    if mesh is not None:
+        _write_mesh(context, cameras, scene, mesh, seen, jaws, folder, frame, scale, skipped)
+    elif config.mesh:
+        skipped["mesh"] = "too little surface for a mesh"
+        context.warn(
+            "No mesh was made: too little of the surface is known. More photographs that "
+            "overlap would help; the other exports are complete."
+        )
+    if config.preview:
+        _write_preview(scene, mesh, folder)
+    return len(mesh) if mesh is not None else None, page_bytes
 
 
 def _write_mesh(

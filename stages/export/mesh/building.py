@@ -42,7 +42,7 @@ SMALLEST_PART = 0.02
 LARGEST_HOLE = 40
 
 
-def build_mesh(
+def raw_surface(
     scene: Scene,
     method: str,
     resolution: int,
@@ -50,10 +50,9 @@ def build_mesh(
     between_views: int,
     reach_behind: float,
     confidence: float,
-    most_faces: int,
     progress: Progress,
 ) -> Mesh | None:
-    """Reconstruct the surface, clean and simplify it, with even rims.
+    """Reconstruct the surface near what is trusted, as it comes.
 
     Args:
         scene: what to mesh.
@@ -63,11 +62,10 @@ def build_mesh(
         between_views: further viewpoints to fuse.
         reach_behind: how far behind the scene's centre, in half widths of a photograph.
         confidence: points above it support the mesh.
-        most_faces: triangles, at most.
         progress: called with (step, done, total).
 
     Returns:
-        The mesh, or None if too little is there.
+        The surface, or None if too little is trusted.
     """
     voxel = 2 * scene.orbit.radius / resolution
     trusted: Points = scene.points[scene.points.confidence > confidence]
@@ -85,7 +83,13 @@ def build_mesh(
             return None
         octree = int(np.clip(np.ceil(np.log2(resolution)), 5, DEEPEST_OCTREE))
         surface = poisson(oriented.positions, oriented.normals, oriented.colors, octree)
-    surface = drop_small_parts(keep_near(surface, trusted.positions, reach), SMALLEST_PART)
+    return keep_near(surface, trusted.positions, reach)
+
+
+def clean_mesh(surface: Mesh, most_faces: int) -> Mesh | None:
+    """A surface without loose parts and holes, of at most so many triangles, with even rims; None
+    if too little is left."""
+    surface = drop_small_parts(surface, SMALLEST_PART)
     if len(surface) < FEWEST_FACES:
         return None
     surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE), SMALLEST_PART)
@@ -107,7 +111,7 @@ def fused(
     Args:
         trusted: the surface is sought within `reach` of these.
         voxel, reach: world units.
-        scene, cell, between_views, reach_behind, progress: see `build_mesh`.
+        scene, cell, between_views, reach_behind, progress: see `raw_surface`.
     """
     from stages.export.pictures.orbits import between
 
