@@ -37,7 +37,7 @@ Picture = npt.NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parent.parent
 #: What a reading depends on: the reader's files without those that choose among readings.
 READER = ("stages/teeth/*.onnx", "stages/teeth/*.py", "stages/dentition/crowns.py",
-          "stages/dentition/tooth_rows.py")  # fmt: skip
+          "stages/dentition/tooth_rows.py", "stages/dentition/far_side.py")  # fmt: skip
 NO_READER = ("choose.py", "stage.py", "config.py", "__init__.py")
 
 

@@ -11,7 +11,15 @@ from scipy.special import softmax
 
 from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
-from stages.dentition.crowns import Outline, centroid, dentition_of, row_roll
+from stages.dentition.crowns import (
+    Outline,
+    centroid,
+    dentition_of,
+    outline_of,
+    row_roll,
+    with_outlines,
+)
+from stages.dentition.far_side import far_side_apart
 from stages.dentition.tooth_rows import (
     POSITIONS,
     ChainOptions,
@@ -37,6 +45,9 @@ _LEAST_CROWNS = 3
 _UPRIGHT, _MORE_UPRIGHT, _LEAST_IN_ROW = 2.8, 0.5, 3
 #: Logit of the jaw that counts as much in that as certainty about a tooth's place.
 _JAW_UNIT = 5.0
+#: Around crowns seen through a gap there is no gum within this share of the band (a millimetre):
+#: what the network takes for it are slivers of these crowns.
+_BESIDE_FAR_SIDE = 0.06
 #: Numbers less probable than this are not kept.
 _LEAST_SHARE = 1e-4
 
@@ -93,11 +104,15 @@ def read_photograph(
     if not crowns:
         return Reading(Dentition(name, size, "none"), kinds, apart)
     likely = max(kinds, key=lambda k: kinds[k])
-    outlines = _outlines(crowns)
-    dentition = replace(
-        dentition_of(outlines, name, size, likely), on_jaws=on_jaws([first, answer], size)
-    )
-    return Reading(numbered(dentition, options or ChainOptions()), kinds, apart)
+    chain = options or ChainOptions()
+    dentition = numbered(dentition_of(_outlines(crowns), name, size, likely), chain)
+    near, behind = far_side_apart(dentition)
+    if behind:
+        dentition = with_outlines(dentition, [outline_of(crown) for crown in near])
+        dentition = numbered(dentition, chain)
+    margin = _BESIDE_FAR_SIDE * dentition.band_height
+    jaws = on_jaws([first, answer], size, [crown.outline for crown in behind], margin)
+    return Reading(replace(dentition, on_jaws=jaws), kinds, apart)
 
 
 class Glances:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.teeth import filled_polygons
 from stages.teeth.network import Answer
 
 Array = npt.NDArray[np.float64]
@@ -21,17 +22,27 @@ _LEAST_SHARE = 2e-4
 _TOLERANCE = 0.5
 
 
-def on_jaws(answers: Sequence[Answer], size: tuple[int, int]) -> tuple[Array, ...]:
+def on_jaws(
+    answers: Sequence[Answer], size: tuple[int, int], behind: Sequence[Array] = (),
+    margin: float = 0.0,
+) -> tuple[Array, ...]:  # fmt: skip
     """`Dentition.on_jaws` from looks at one photograph.
 
     Args:
         answers: the looks; where several saw a place, the last one's word counts.
         size: width and height of the photograph.
+        behind: [K, 2] polygons around what is seen through a gap between the rows, and is neither.
+        margin: pixels around these that are neither.
     """
     logit = np.full((size[1], size[0]), _UNSEEN, np.float32)
     for answer in answers:
         there = _in_photograph(answer, np.ones_like(answer.on_jaws), size) > 0.99
         logit[there] = _in_photograph(answer, answer.on_jaws, size)[there]
+    if behind:
+        hidden = filled_polygons(tuple(behind), size).astype(np.uint8)
+        reach = 2 * round(margin) + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+        logit[cv2.dilate(hidden, kernel) > 0] = _UNSEEN
     contours, _ = cv2.findContours(
         (logit > 0).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
     )

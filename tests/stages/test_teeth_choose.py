@@ -76,8 +76,15 @@ def test_one_jaw_alone_is_set_aside_only_if_it_looks_odd() -> None:
 def test_open_mouths_are_set_aside() -> None:
     ajar, wide = (dentition(apart=gap) for gap in (18.0, 60.0))
     assert reasons(reading(ajar, apart=0.2)) == [""]
-    assert "apart" in reasons(reading(ajar, apart=0.9))[0]
+    assert "apart" in reasons(reading(ajar, apart=0.6))[0]
     assert "apart" in reasons(reading(wide, apart=0.0))[0]
+
+
+def test_an_open_bite_that_closes_on_the_molars_takes_part() -> None:
+    closed = dentition(apart=-2.0)
+    assert closed.jaws_apart == 0
+    assert reasons(reading(closed, "right", apart=0.7)) == [""]
+    assert "apart" in reasons(reading(closed, "right", apart=0.9))[0]
 
 
 def test_pictures_without_colour_teeth_or_size_are_set_aside() -> None:
