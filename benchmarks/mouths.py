@@ -1,6 +1,6 @@
 """Three photographs of generated mouths: are the numbers and the angles between cameras right?
 
-    python benchmarks/mouths.py --count 30 [--first 0] [--jobs 2] [--out DIR]
+    python benchmarks/mouths.py --count 30 [--first 0] [--bite open] [--jobs 2] [--out DIR]
 
 Every photograph has a lens, a distance, a crop and a light of its own, so that most are refused for
 their colours: numbers and angles are those of the fit, whatever becomes of it. Angles are between
@@ -30,6 +30,7 @@ from triads_data import CASE, Item, Photo
 from triads_run import Outcome, Runner
 
 from data_samples.mouths.mouth import random_mouth
+from data_samples.mouths.options import BITES
 from data_samples.mouths.photo import photograph
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.overlay import DOUBT_SHOWN
@@ -45,16 +46,17 @@ SIZE = (1024, 768)
 ARCH_WIDTH, ARCH_WIDTH_SPREAD, ARCH_POWERS = 1.04, 0.06, (2.5, 3.3)
 
 
-def make_photographs(folder: Path, seed: int) -> None:
+def make_photographs(folder: Path, seed: int, bite: str | None = None) -> None:
     """Three photographs of a mouth, labels beside them, cameras in `truth.json`; once."""
     if (folder / "truth.json").exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([5, seed])
     form = np.random.default_rng([6, seed])
+    said = {"dentition": "permanent", "bite": bite} if bite else {}
     mouth = random_mouth(
         rng, arch_width=float(form.normal(ARCH_WIDTH, ARCH_WIDTH_SPREAD)),
-        arch_power=float(form.uniform(*ARCH_POWERS)),
+        arch_power=float(form.uniform(*ARCH_POWERS)), **said,
     )  # fmt: skip
     cameras = []
     for stem in ROLES:
@@ -94,11 +96,11 @@ def numbers(outcome: Outcome, folder: Path, names: dict[str, str]) -> dict[str, 
     return found
 
 
-def run_mouth(seed: int, out: Path) -> dict[str, Any]:
+def run_mouth(seed: int, out: Path, bite: str | None = None) -> dict[str, Any]:
     """One mouth: what the fit made of it, against the truth."""
     cv2.setNumThreads(1)
-    folder = out / f"mouth_{seed:04d}"
-    make_photographs(folder, seed)
+    folder = out / (f"mouth_{bite}_{seed:04d}" if bite else f"mouth_{seed:04d}")
+    make_photographs(folder, seed, bite)
     truth = json.loads((folder / "truth.json").read_text())
     photos = tuple(Photo(folder.name, folder / f"{stem}.jpg", stem) for stem in ROLES)
     outcome = Runner(out / "readings", 1, {"method": "dental"}).run(Item(folder.name, CASE, photos))
@@ -106,10 +108,13 @@ def run_mouth(seed: int, out: Path) -> dict[str, Any]:
     row: dict[str, Any] = {
         "seed": seed, "dentition": truth["dentition"], "accepted": outcome.accepted,
         "doubts": list(outcome.fit.doubts) if outcome.fit else [outcome.message],
-        "off": [], "believed": [], **numbers(outcome, folder, names),
+        "off": [], "believed": [], "places": None, **numbers(outcome, folder, names),
     }  # fmt: skip
     if outcome.fit is None:
         return row
+    figures = outcome.fit.figures
+    places = [value for name, value in figures.items() if name.startswith("common_mouth")]
+    row["places"] = min(places, default=None)
     placed = {
         names[name]: view.cam_from_world[:3, :3]
         for name, view in zip(outcome.fitted, outcome.fit.views, strict=True)
@@ -124,7 +129,7 @@ def run_mouth(seed: int, out: Path) -> dict[str, Any]:
         turn, found = true[two] @ true[one].T, placed[two] @ placed[one].T
         row["off"].append(angle_between(turn, found))
         i, j = sorted((order.index(one), order.index(two)))
-        row["believed"].append(outcome.fit.figures.get(f"angle_deviation_{i}_{j}", np.nan))
+        row["believed"].append(figures.get(f"angle_deviation_{i}_{j}", np.nan))
     return row
 
 
@@ -137,6 +142,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
     ):
         if not mine:
             continue
+        agree = sum((r["places"] or -1) >= 0 for r in mine)
         right, wrong, marked = (sum(r[k] for r in mine) for k in ("right", "wrong", "marked"))
         off = np.array([angle for r in mine for angle in r["off"]])
         believed = np.array([angle for r in mine for angle in r["believed"]])
@@ -148,7 +154,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
                 f"known to {np.nanmedian(believed):.1f}"
             )
         lines.append(
-            f"{name}: {len(mine)} mouths, {sum(r['accepted'] for r in mine)} scenes; numbers "
+            f"{name}: {len(mine)} mouths, {sum(r['accepted'] for r in mine)} scenes, places agree "
+            f"in {agree}; numbers "
             f"{right} right, {wrong} wrong ({marked} marked); {angles}"
         )
     return "\n".join(lines)
@@ -158,6 +165,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=0, help="mouths")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--bite", choices=BITES, help="of all of them")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder that is kept")
     options = parser.parse_args()
@@ -169,7 +177,8 @@ def main() -> None:
         seeds = range(options.first, options.first + options.count)
         rows = []
         with ProcessPoolExecutor(options.jobs, mp_context=get_context("forkserver")) as pool:
-            for row in pool.map(partial(run_mouth, out=out), seeds):
+            work = partial(run_mouth, out=out, bite=options.bite)
+            for row in pool.map(work, seeds):
                 rows.append(row)
                 print(json.dumps(row), flush=True)
         print(summary(rows))

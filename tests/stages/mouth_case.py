@@ -28,7 +28,10 @@ from pipeline.artifacts.dental.fdi import (
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import angle_between
-from stages.dentition.crowns import Outline, dentition_of
+from stages.dentition.crowns import Outline, dentition_of, outline_of, with_outlines
+from stages.dentition.far_side import far_side
+from stages.dentition.tooth_rows import LOOKS
+from stages.teeth.read import numbered
 from tests.stages.dental_arch_scene import pieces
 
 WIDTH, HEIGHT = 512, 384
@@ -67,11 +70,13 @@ class Case:
         """Exact outlines of every photograph, put in order as the reader's are."""
         return [
             replace(
-                dentition_of(
-                    outlines_of(photo.labels, **looks),
-                    f"{k:03d}",
-                    (photo.image.shape[1], photo.image.shape[0]),
-                    photo.view,
+                _near_side(
+                    dentition_of(
+                        outlines_of(photo.labels, **looks),
+                        f"{k:03d}",
+                        (photo.image.shape[1], photo.image.shape[0]),
+                        photo.view,
+                    )
                 ),
                 on_jaws=pieces(photo.gum | (photo.labels > 0)),
             )
@@ -81,6 +86,18 @@ class Case:
     @property
     def rotations(self) -> list[np.ndarray]:
         return [photo.cam_from_world[:3, :3] for photo in self.photos]
+
+
+def _near_side(dentition: Dentition) -> Dentition:
+    """Without what is seen across the mouth, which the reader leaves out as well."""
+    numbers = numbered(dentition, LOOKS)
+    kept = [
+        outline_of(crown)
+        for jaw in JAWS
+        for crown, far in zip(dentition.crowns(jaw), far_side(numbers, jaw), strict=True)
+        if not far
+    ]
+    return with_outlines(dentition, kept)
 
 
 @contextmanager

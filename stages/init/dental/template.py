@@ -198,3 +198,21 @@ def textbook_arch(
                 result[landmark_index(jaw, EMBRASURE, gap)] = half[3, i]
     result.flags.writeable = False
     return result
+
+
+@lru_cache(maxsize=1)
+def facing_yaws() -> Array:
+    """[L] degrees from which one looks at each landmark of the textbook arch face to face (0: from
+    the front, positive: from the patient's left). Not to be written to."""
+    arch = textbook_arch()
+    result = np.empty(len(arch))
+    for index, name in enumerate(landmark_names()):
+        jaw: Jaw = "upper" if is_upper(name.tooth) else "lower"
+        first = position_of(name.tooth)
+        last = first + 1
+        if not name.neighbour:
+            first, last = max(first - 1, 0), min(last, POSITIONS - 1)
+        along = arch[landmark_index(jaw, ZENITH, last)] - arch[landmark_index(jaw, ZENITH, first)]
+        result[index] = np.degrees(np.arctan2(-along[2], along[0]))
+    result.flags.writeable = False
+    return result

@@ -329,7 +329,7 @@ def _outcome(
     ones three by a sixth).
     """
     adjusted, labelling = best.adjusted, best.labelling
-    sightings = scorer.cache.collect(list(labelling.views), list(labelling.labels))
+    sightings = scorer.sightings(labelling)
     errors = landmark_errors(adjusted, sightings)
     names = landmark_names()
     seen = np.unique(sightings.landmark)

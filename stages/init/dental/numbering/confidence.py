@@ -109,7 +109,7 @@ def same_mouth(evidence: Evidence, options: ArchOptions) -> SameMouth:
     for view, (common, colour) in enumerate(
         zip(evidence.common_mouth, evidence.colours, strict=True)
     ):
-        places = common / options.common_mouth_unit
+        places = (common - options.common_mouth_by_chance) / options.common_mouth_unit
         share = max((p.share for pair, p in evidence.pairs.items() if view in pair), default=0.0)
         hue = options.colour_weight * (options.max_colour - colour.one_light)
         one.append(places + hue + sitting)
@@ -178,7 +178,8 @@ def fit_doubts(
     figures["same_mouth_one_light"] = one.one_light
     # One photograph of another patient makes all three strangers to each other: the worst is named.
     if one.sureness < 0 and not known:
-        doubts.append(_stranger(photos[one.odd], places_fit=evidence.common_mouth[one.odd] > 0))
+        fit = evidence.common_mouth[one.odd] > options.common_mouth_by_chance
+        doubts.append(_stranger(photos[one.odd], places_fit=fit))
     for view, factor in evidence.mirrored.items():
         figures[f"mirrored_{view}"] = factor
         if factor > PERHAPS_MIRRORED:
@@ -228,7 +229,7 @@ def _view_doubts(
     """Doubts about single photographs; their figures are added."""
     adjusted, labelling = best.adjusted, best.labelling
     doubts = []
-    sightings = scorer.cache.collect(list(labelling.views), list(labelling.labels))
+    sightings = scorer.sightings(labelling)
     errors = landmark_errors(adjusted, sightings)
     priors = scorer.priors(labelling.views, labelling.roles)
     for view, photo in enumerate(photos):

@@ -188,7 +188,7 @@ def row_trial(
         ]
     )
     adjusted = adjust(
-        scorer.cache.collect([view], [labels]),
+        scorer.sightings(Labelling((view,), (role,), (labels,))),
         points,
         scorer.priors((view,), (role,)),
         TRIED_DEVIATION,

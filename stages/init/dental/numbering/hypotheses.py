@@ -17,7 +17,14 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import is_upper
 from stages.dentition.tooth_rows import LOOKS, NO_TOOTH, Labels, best_rows
-from stages.init.dental.cameras.bundle import NO_MATCHES, Adjusted, CameraPriors, Matches, adjust
+from stages.init.dental.cameras.bundle import (
+    NO_MATCHES,
+    Adjusted,
+    CameraPriors,
+    Matches,
+    Sightings,
+    adjust,
+)
 from stages.init.dental.cameras.held import HeldCameras
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.arch_options import ArchOptions
@@ -144,6 +151,11 @@ class Scorer:
             "between left": (side / 2, spread),
         }
 
+    def sightings(self, labelling: Labelling) -> Sightings:
+        """What a labelling says was seen, views numbered as it has them."""
+        yaws = [self._yaw_of[role][0] for role in labelling.roles]
+        return self.cache.collect(labelling.views, labelling.labels, yaws)
+
     def priors(self, views: tuple[int, ...], roles: tuple[str, ...]) -> CameraPriors:
         """Camera priors of some views in their roles."""
         options = self.options
@@ -226,7 +238,7 @@ class Scorer:
                 with different ones don't compare.
         """
         adjusted = adjust(
-            self.cache.collect(list(labelling.views), list(labelling.labels)),
+            self.sightings(labelling),
             textbook_arch(labelling.closed, labelling.primary),
             self.priors(labelling.views, labelling.roles),
             deviation or self.options.numbering_deviation,
