@@ -80,9 +80,9 @@ class ArchOptions:
     #: units, and the distance of colours below the largest usual one by this weight, must not come
     #: to less than 0 together.
     common_mouth_unit: float = 6.0
-    #: What places come to by themselves: mouths are more alike than the model believes. Of 96
-    #: triads (twelve patients as they are and altered in seven ways) 94 pass, and 10 of 396 mixes
-    #: of two patients; without it 95 and 14, with 15 92 and 8.
+    #: What places of three and more photographs come to by themselves: mouths are more alike than
+    #: the model believes. Of 96 triads (twelve patients as they are and altered in seven ways) 94
+    #: pass, and 10 of 396 mixes of two patients; without it 95 and 14, with 15 92 and 8.
     common_mouth_by_chance: float = 10.0
     colour_weight: float = 6.0
     max_colour: float = 2.2

@@ -105,11 +105,12 @@ def same_mouth(evidence: Evidence, options: ArchOptions) -> SameMouth:
     """Weigh places of the teeth, colours, dense matches, and whether the camera's clock says that
     it was one sitting; by the photograph that fits worst."""
     one, other = [], []
+    by_chance = options.common_mouth_by_chance if len(evidence.colours) > 2 else 0.0
     sitting = {True: 1.0, False: -1.0, None: 0.0}[options.one_sitting] * options.sitting_evidence
     for view, (common, colour) in enumerate(
         zip(evidence.common_mouth, evidence.colours, strict=True)
     ):
-        places = (common - options.common_mouth_by_chance) / options.common_mouth_unit
+        places = (common - by_chance) / options.common_mouth_unit
         share = max((p.share for pair, p in evidence.pairs.items() if view in pair), default=0.0)
         hue = options.colour_weight * (options.max_colour - colour.one_light)
         one.append(places + hue + sitting)

@@ -152,9 +152,15 @@ class Scorer:
         }
 
     def sightings(self, labelling: Labelling) -> Sightings:
-        """What a labelling says was seen, views numbered as it has them."""
+        """What a labelling says was seen, views numbered as it has them.
+
+        Of two photographs alone, landmarks stay where they were seen: what is taken back rests on
+        angles that are not known yet, and of 24 pairs 17 pass with it, 20 without.
+        """
         yaws = [self._yaw_of[role][0] for role in labelling.roles]
-        return self.cache.collect(labelling.views, labelling.labels, yaws)
+        return self.cache.collect(
+            labelling.views, labelling.labels, yaws if len(self.rows) > 2 else None
+        )
 
     def priors(self, views: tuple[int, ...], roles: tuple[str, ...]) -> CameraPriors:
         """Camera priors of some views in their roles."""

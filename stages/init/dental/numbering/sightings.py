@@ -338,14 +338,15 @@ class SightingCache:
         return row.landmark_count - offered + max(offered - named, 0)
 
     def collect(
-        self, views: Sequence[int], labels: Sequence[tuple[Labels, Labels]], yaws: Sequence[float]
-    ) -> Sightings:
+        self, views: Sequence[int], labels: Sequence[tuple[Labels, Labels]],
+        yaws: Sequence[float] | None,
+    ) -> Sightings:  # fmt: skip
         """Sightings of some views under their labels; views are numbered as in `views`.
 
         Args:
             views: which.
             labels: of their rows.
-            yaws: degrees from which they look, roughly.
+            yaws: degrees from which they look, roughly; None: landmarks stay where they were seen.
         """
         parts = [
             (number, *self.of_row(view, jaw, labels[number][jaw]))
@@ -356,11 +357,10 @@ class SightingCache:
         landmark = np.concatenate([part[1] for part in parts])
         pixels = np.ascontiguousarray(values[:, :2])
         counts = [len(part[1]) for part in parts]
-        bands = [self.rows[view][jaw].band for view in views for jaw in (0, 1)]
-        wandering = np.concatenate(
-            [_wandering(float(yaws[part[0]]))[part[1]] for part in parts]
-        )  # fmt: skip
-        pixels[:, 1] -= np.repeat(bands, counts) * wandering
+        if yaws is not None:
+            bands = [self.rows[view][jaw].band for view in views for jaw in (0, 1)]
+            wandering = [_wandering(float(yaws[number]))[marks] for number, marks, _ in parts]
+            pixels[:, 1] -= np.repeat(bands, counts) * np.concatenate(wandering)
         return Sightings(
             view=np.repeat([part[0] for part in parts], counts),
             landmark=landmark,
