@@ -6,8 +6,9 @@ Every photograph has a lens, a distance, a crop and a light of its own, so that 
 their colours: numbers and angles are those of the fit, whatever becomes of it. Angles are between
 the photograph from the front and those from the sides; a true camera whose principal point is not
 in the middle of its photograph counts as turned to what is. What the fit believes is the standard
-deviation that it gives itself. OUT keeps photographs and readings, which makes the next run
-quicker.
+deviation that it gives itself. Places agree where they alone would pass for one mouth's in all
+three photographs. With --bite all mouths are grown-ups' with that bite. OUT keeps photographs and
+readings, which makes the next run quicker.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from data_samples.mouths.options import BITES
 from data_samples.mouths.photo import photograph
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.overlay import DOUBT_SHOWN
+from stages.init.dental.numbering.arch_options import ArchOptions
 
 Floats = npt.NDArray[np.float64]
 ROLES = ("right", "front", "left")
@@ -142,7 +144,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
     ):
         if not mine:
             continue
-        agree = sum((r["places"] or -1) >= 0 for r in mine)
+        least = ArchOptions().common_mouth_by_chance
+        agree = sum(r["places"] is not None and r["places"] >= least for r in mine)
         right, wrong, marked = (sum(r[k] for r in mine) for k in ("right", "wrong", "marked"))
         off = np.array([angle for r in mine for angle in r["off"]])
         believed = np.array([angle for r in mine for angle in r["believed"]])

@@ -16,8 +16,8 @@ from pipeline.artifacts.teeth import Crown, Dentition
 Array = npt.NDArray[np.float64]
 
 #: A crown between the rows reaches less far towards the gum than this share of its neighbours'
-#: height. In photographs of 130 people and of 72 generated mouths 98 % of the teeth reach further
-#: than .5; of those seen through the gap, 4 in 5 do not.
+#: height: of 133 such crowns of 72 generated mouths 127 (.66 at most). Of crowns that have a number
+#: 2 % reach no further either, and these stay.
 REACH = 0.5
 #: Neighbours are crowns no further away than this many median widths.
 NEAR = 1.0

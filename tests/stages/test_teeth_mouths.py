@@ -23,7 +23,6 @@ from stages.init.stage import InitStage
 from stages.teeth.read import Reading
 from stages.teeth.reader import read_photographs
 from tests.stages.mouth_case import (
-    DOUBTED,
     Case,
     mouth_case,
     relative_errors,
@@ -99,18 +98,21 @@ def changing(seed: int) -> tuple[Case, tuple[Dentition, ...], ArchFit]:
     return photographed, tuple(dentitions), fitted(photographed, dentitions)
 
 
-def test_places_of_changing_teeth() -> None:
-    photographed, dentitions, fit = changing(15)
+@pytest.mark.parametrize(
+    ("seed", "known"), [(5, set()), (15, {("right", 63, 22), ("left", 12, 53)})]
+)
+def test_places_of_changing_teeth(seed: int, known: set[tuple[str, int, int]]) -> None:
+    """All but a strip at the end of a row, and across the midline what is taken for a part of 12;
+    however doubtful they are."""
+    photographed, dentitions, fit = changing(seed)
     wrong = set()
     for photo, dentition in zip(photographed.photos, named(list(dentitions), fit), strict=True):
         truth = true_numbers(photo, dentition)
         for jaw in JAWS:
             for crown, true in zip(dentition.crowns(jaw), truth[jaw], strict=True):
-                sure = crown.number and crown.doubt < DOUBTED
-                if sure and permanent_of(crown.number) != permanent_of(true):
+                if crown.number and permanent_of(crown.number) != permanent_of(true):
                     wrong.add((photo.view, crown.number, true))
-    # Of 58: a strip at the end of a row, and across the midline what is taken for a part of 12.
-    assert wrong <= {("right", 63, 22), ("left", 12, 53)}
+    assert wrong <= known
 
 
 @pytest.mark.parametrize(
