@@ -102,6 +102,8 @@ class ExportStage(Stage):
             if context.has("teeth"):
                 mouth, teeth = _write_teeth(context, views, scene, folder, frame, scale)
             if config.mesh:
+                import pymeshlab  # noqa: F401  its Qt outlives no other thread: aborts at exit
+
                 raw = raw_surface(
                     scene, config.mesh_method, config.mesh_resolution, config.mesh_cell,
                     config.mesh_views, config.mesh_depth, config.mesh_confidence, context.progress,

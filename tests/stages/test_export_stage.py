@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +122,31 @@ def test_pngs_hold_pixels_only(folder: Path) -> None:
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, folder: Path) -> None:
     again = export(tmp_path, threads=2, inputs=metric_case())
     assert bytes_of(again.folder / "exports") == bytes_of(folder)
+
+
+WHO_LOADS = """
+import sys, threading
+from pathlib import Path
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "pymeshlab":
+            print("in the main thread:", threading.current_thread() is threading.main_thread())
+
+sys.meta_path.insert(0, Watch())
+from tests.stages.test_export_stage import export
+export(Path(sys.argv[1]), threads=2, splat_files=False, video=False)
+"""
+
+
+def test_pymeshlab_is_loaded_in_the_main_thread(tmp_path: Path) -> None:
+    # PyMeshLab's Qt belongs to the thread that loads it: once that has ended, the program's own
+    # end writes into freed memory (valgrind; `malloc_consolidate(): unaligned fastbin chunk`)
+    command = [sys.executable, "-c", WHO_LOADS, str(tmp_path)]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "in the main thread: True\n"
 
 
 def test_splats_are_in_the_stated_frame(folder: Path) -> None:
