@@ -23,10 +23,11 @@ NATURAL_TILT = math.radians(5)
 ZENITH_FLATNESS, TIP_FLATNESS, PARTING_FLATNESS = 0.035, 0.03, 0.015
 #: Neighbours further apart than this share of the narrower one's width have no papilla in common.
 GAP = 0.2
-#: Neighbours nearer to each other than this share of the band meet there (half a millimetre). On
-#: twelve patients' photographs the cameras explain papillae best with .015 to .03, and the same
-#: mouth is surer the larger it is.
-MEETING = 0.03
+#: Neighbours no further from each other than where they are nearest, and this share of the band
+#: (.7 mm), meet there. Landmarks of twelve patients lie 1.40 % of the band off their epipolar lines
+#: (.02 to .06: 1.40 to 1.58 %); the places of the teeth of 32 generated mouths, half of them with
+#: gaps all over, agree in 25 (.03: 23, .02: 22; 19 where a gap left its papilla anywhere).
+MEETING = 0.045
 #: A crown nearer to the border of the photograph than this share of its size goes on outside.
 BORDER = 0.008
 #: Crowns scoring less are doubtful.
@@ -281,12 +282,13 @@ def _steps(start: float, end: float, band: float) -> Array | None:
 
 
 def _papilla(first: _Local, second: _Local, band: float) -> Array | None:
-    """(along, gumward) where two neighbours meet below the gum: nearest to it, as near to each
-    other as `MEETING`; or where they are nearest.
+    """(along, gumward) where two neighbours meet below the gum: nearest to it, hardly further from
+    each other (`MEETING`) than where they are nearest.
 
     Crowns that overlap in the picture meet in a corner, but their sides are nearly parallel there,
     and it slides along them with every pixel of overlap, down to where the crowns are widest. A
-    little further up the sides part quickly.
+    little further up the sides part quickly. Crowns with a little gap between them have their
+    papilla where those that touch have it.
 
     Args:
         first, second: their outlines, left and right.
@@ -302,8 +304,8 @@ def _papilla(first: _Local, second: _Local, band: float) -> Array | None:
     opening = after - before
     if np.isfinite(opening).sum() < 4:
         return None
-    meeting = np.flatnonzero(opening <= MEETING * band)
-    k = int(meeting[-1]) if len(meeting) else int(np.nanargmin(opening))
+    nearest = max(float(np.nanmin(opening)), 0.0)
+    k = int(np.flatnonzero(opening <= nearest + MEETING * band)[-1])
     return np.array([(before[k] + after[k]) / 2, heights[k]])
 
 
