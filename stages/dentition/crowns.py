@@ -25,8 +25,9 @@ ZENITH_FLATNESS, TIP_FLATNESS, PARTING_FLATNESS = 0.035, 0.03, 0.015
 GAP = 0.2
 #: Neighbours no further from each other than where they are nearest, and this share of the band
 #: (.7 mm), meet there. Landmarks of twelve patients lie 1.40 % of the band off their epipolar lines
-#: (.02 to .06: 1.40 to 1.58 %); the places of the teeth of 32 generated mouths, half of them with
-#: gaps all over, agree in 25 (.03: 23, .02: 22; 19 where a gap left its papilla anywhere).
+#: (.02 to .06: 1.40 to 1.58 %); the evidence that photographs show one mouth is 10 and more for 25
+#: of 32 generated ones, half of them with gaps all over (.03: 23, .02: 22; 19 where a gap left its
+#: papilla anywhere).
 MEETING = 0.045
 #: A crown nearer to the border of the photograph than this share of its size goes on outside.
 BORDER = 0.008
