@@ -82,7 +82,7 @@ class ArchOptions:
     common_mouth_unit: float = 6.0
     #: What places of three and more photographs come to by themselves: mouths are more alike than
     #: the model believes. Of 84 triads (twelve patients, each altered in seven ways) 82 pass, and
-    #: of 396 mixes of two patients 10; with 8 or 10 as many and 15 or 13, with 20 as many and 7, but
+    #: of 396 mixes of two patients 10; with 8 or 10 as many and 15 or 13, with 20 as many, 7, but
     #: photographs of one mouth pass more narrowly.
     common_mouth_by_chance: float = 15.0
     colour_weight: float = 6.0
