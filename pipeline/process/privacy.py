@@ -5,8 +5,10 @@ is written. The functions of `import pipeline` set it while they run and put it 
 files that other threads of the caller write meanwhile are kept from others too, which errs on the
 safe side. Files that libraries write obey the mask as well.
 
-A workspace remembers whom it is for by the mode of its folder: 0750 is for the group too, anything
-else for the owner alone. No setting and no key knows of it.
+A workspace remembers whom it is for by the mode of a file in it that is always its own (`_TELLING`:
+0640 is for the group too, anything else for the owner alone), or of its folder where there is none
+yet; the folder alone won't do, since it may be the user's own and stay as it is. No setting and no
+key knows of it.
 """
 
 from __future__ import annotations
@@ -25,6 +27,9 @@ SHARES: tuple[Share, ...] = get_args(Share)
 
 #: What is taken away from whoever is not the owner.
 _MASKS: dict[Share, int] = {"nobody": 0o077, "group": 0o027}
+
+#: Files of which every workspace, stage, batch, and benchmark has one.
+_TELLING = ("request.json", ".lock")
 
 _inherited: ContextVar[Share | None] = ContextVar("share", default=None)
 _lock = threading.Lock()
@@ -78,11 +83,14 @@ def share_for(folder: Path, asked: Share | None = None) -> Share:
     inherited = _inherited.get()
     if inherited is not None:
         return inherited
-    try:
-        mode = folder.stat().st_mode
-    except OSError:
-        return "nobody"
-    return "group" if mode & 0o057 == 0o050 else "nobody"
+    for place in (*(folder / name for name in _TELLING), folder):
+        with contextlib.suppress(OSError):
+            mode = place.stat().st_mode
+            if stat.S_ISREG(mode):
+                return "group" if mode & 0o047 == 0o040 else "nobody"
+            if stat.S_ISDIR(mode):
+                return "group" if mode & 0o057 == 0o050 else "nobody"
+    return "nobody"
 
 
 def tighten(path: Path, share: Share) -> list[Path]:

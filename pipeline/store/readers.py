@@ -10,10 +10,11 @@ from pipeline.process.privacy import Share, tighten
 from pipeline.store.locks import LOCK
 from pipeline.store.places import ASIDE, is_folder, is_there
 
-#: What a workspace and a folder of a benchmark hold besides the folders of stages.
+#: What a workspace and the folders of a benchmark and a batch hold besides the folders of stages.
 _OWN = {
-    LOCK, "request.json", "pages.json", "results", "report.html", "check.html", "teeth.yaml",
-    "logs", "compare", "cells", "results.json", "tables.md", "tables.csv",
+    LOCK, "request.json", "pages.json", "results", "report.html", "report_anonymous.html",
+    "check.html", "teeth.yaml", "logs", "profile", "compare", "dicom", "register",
+    "cells", "results.json", "tables.md", "tables.csv", "batch.json", "summary.csv", "summary.html",
 }  # fmt: skip
 
 

@@ -125,6 +125,27 @@ def test_what_else_lies_in_its_folder_is_left_alone(run: Any, toys: Path) -> Non
         assert not (toys / "w" / name).stat().st_mode & 0o077, name
 
 
+def test_it_is_remembered_beside_what_else_lies_in_its_folder(run: Any, toys: Path) -> None:
+    (toys / "w").mkdir(mode=0o750)
+    (toys / "images").rename(toys / "w" / "photos")
+    photos = toys / "w" / "photos"
+    run(images=photos, share="group")
+    run(images=photos, share="nobody")
+    assert run("count.steps=3", images=photos)["count"] == "ran"
+    for name in ("request.json", "report.html", "count"):
+        assert not (toys / "w" / name).stat().st_mode & 0o077, name
+
+
+def test_what_other_commands_leave_is_its_own(run: Any, toys: Path) -> None:
+    run(share="group")
+    for name in ("dicom", "register", "profile"):
+        (toys / "w" / name).mkdir()
+        (toys / "w" / name / "of.txt").write_text("a patient's")
+    (toys / "w" / "report_anonymous.html").write_text("")
+    run(share="nobody")
+    assert modes(toys / "w") == PRIVATE
+
+
 def test_what_can_t_be_closed_is_told(
     run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
