@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -80,12 +80,17 @@ def resolve_chain(
     from_stage: str | None,
     images_named: bool,
     store: Store,
+    asked: Collection[str] = (),
 ) -> Chain:
     """Turn ``--stages`` and ``--from`` into the list of stages to run.
 
     Named stages run in the order given and take their input from each other; what the first of them
     needs from before comes from the workspace as it is in use. A stage that reads the photographs
-    runs first whenever photographs are named; otherwise what it read before is taken as it is.
+    runs first whenever photographs are named; otherwise what it read before is taken as it is,
+    unless that was read with other settings than this run's.
+
+    Args:
+        asked: stages for which this very request has settings.
 
     Raises:
         RequestError: an unknown stage, or one named twice.
@@ -113,12 +118,22 @@ def resolve_chain(
         names = (*names[:after], *prepared, *names[after:])
         implicit += prepared
     elif not stages and not from_stage:
-        names = tuple(n for n in names if n not in readers or store.current(n) is None)
+        kept = {n for n in readers if n not in asked and _read_as_set(n, config, store)}
+        names = tuple(n for n in names if n not in kept)
     first = next((name for name in names if name not in implicit), names[0])
     position = order.index(first) if first in order else len(order)
     upstream = tuple(name for name in order[:position] if name not in names)
     standing = tuple(name for name in order if name in upstream or name in implicit)
     return Chain(names, upstream, implicit, standing)
+
+
+def _read_as_set(name: str, config: Config, store: Store) -> bool:
+    """Has a stage a result in use that was made with these settings, as far as it knew them?"""
+    result = store.current(name)
+    if result is None:
+        return False
+    before, now = result.manifest["key_material"]["config"], result_fields(config.sections[name])
+    return all(before[field] == now[field] for field in before.keys() & now.keys())
 
 
 def _prepares(name: str, names: Sequence[str], usable: Mapping[str, Stage]) -> bool:

@@ -57,8 +57,9 @@ class Runner:
         self.store = Store(request.workspace, verify=verify)
         self._computing: Callable[[str], None] = lambda stage: None
         self.chain = resolve_chain(
-            config, request.stages, request.from_stage, request.images_named, self.store
-        )
+            config, request.stages, request.from_stage, request.images_named, self.store,
+            request.asked,
+        )  # fmt: skip
 
     def plan(self) -> list[PlannedStage]:
         """Look at every stage without running any."""
@@ -129,8 +130,14 @@ class Runner:
         return found
 
     def _check_upstream(self) -> None:
-        """Warn where the results taken as they are do not fit together, or the photographs."""
+        """Warn where results taken as they are do not fit together, or what was asked for."""
         contents: dict[str, str] = {}
+        for name in self.chain.upstream:
+            if name in self.request.asked and self.store.current(name) is not None:
+                self.reporter.message(
+                    f"The settings given for '{name}' change nothing in this run: its result in "
+                    f"use is taken as it is. Run with --from {name} to have it made with them."
+                )
         for name in self.chain.standing:
             result = self.store.current(name)
             if result is None:

@@ -41,6 +41,12 @@ class Request:
     images_named: bool = True
     taken_over: tuple[str, ...] = ()
 
+    @property
+    def asked(self) -> frozenset[str]:
+        """Stages (and `run`) for which the user gave settings this time."""
+        before = {change.removeprefix("--set ") for change in self.taken_over}
+        return frozenset(c.partition(".")[0].strip() for c in self.overrides if c not in before)
+
     def save(self) -> None:
         """Remember the request in the workspace, for `status` and for runs that name no images."""
         entry: dict[str, Any] = {

@@ -12,6 +12,8 @@ from pipeline.store.places import ASIDE, is_folder, is_there, remove, size_of
 
 #: Ends the name of the folder that a result is written into.
 PARTIAL = ".partial"
+#: What a killed run leaves to go on from.
+SCRATCH = "scratch"
 
 
 def clean(
@@ -66,7 +68,7 @@ def holds_checkpoint(partial: Path) -> bool:
 
     What ends in ``.tmp`` is half written, or was of use to that run alone.
     """
-    scratch = partial / "scratch"
+    scratch = partial / SCRATCH
     return is_folder(scratch) and any(path.suffix != ".tmp" for path in scratch.iterdir())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -9,6 +10,9 @@ from pathlib import Path
 from pipeline.files import folder_listing, temporary_beside
 from pipeline.store.places import is_folder, is_there, remove, set_aside
 from pipeline.store.records import MANIFEST, DamagedError, read_manifest
+
+#: What a disk without symbolic links (exFAT) answers.
+NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 
 
 def link_to(root: Path, name: str, folder: Path, stage: str) -> tuple[Path, Path | None]:

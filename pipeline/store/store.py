@@ -38,10 +38,10 @@ from pipeline.files import (
 from pipeline.process.privacy import share_for
 from pipeline.store import checks
 from pipeline.store.checks import mark_of
-from pipeline.store.cleaning import PARTIAL, checkpoints, clean, holds_checkpoint
+from pipeline.store.cleaning import PARTIAL, SCRATCH, checkpoints, clean, holds_checkpoint
 from pipeline.store.failures import EVIDENCE, FAILURE, Failures
 from pipeline.store.faults import reason_of
-from pipeline.store.links import link_to
+from pipeline.store.links import NO_LINKS, link_to
 from pipeline.store.locks import locked
 from pipeline.store.places import (
     is_there,
@@ -219,15 +219,14 @@ class Store:
         stage_folder(self.root, stage)
         partial = make_folder(self._partial(stage, key))
         for entry in partial.iterdir():
-            if entry.name != "scratch":
+            if entry.name != SCRATCH:
                 remove(entry)
-        make_folder(partial / "scratch")
+        make_folder(partial / SCRATCH)
         return partial
 
     def commit(self, stage: str, key: str, manifest: dict[str, Any], kinds: list[str]) -> Result:
         """Make what was written into `begin`'s folder the result of a key, all or nothing."""
         partial = self._partial(stage, key)
-        remove(partial / "scratch")
         marks = {name: mark_of(partial / name) for name in _names(partial, kinds)}
         outputs = {}
         for kind in kinds:
@@ -240,13 +239,16 @@ class Store:
             write_sealed(final / MANIFEST, manifest)  # forced, and the same bytes again
             remove(partial)
             return Result(stage, key, final, manifest)
-        fsync_tree(partial)
+        for kind in kinds:
+            fsync_tree(partial / kind)
         write_sealed(partial / MANIFEST, manifest)
         displaced = final.with_name(f"{final.name}{DISPLACED}")
         if is_there(final):  # two folders can't change places in one step: `_recover` mends a kill
             final.rename(displaced)
         partial.rename(final)
         fsync_folder(final.parent)
+        # only now: a run that is killed before goes on from there
+        remove(final / SCRATCH)
         remove(displaced)
         self._marks[final] = checks.Known(canonical_json(outputs), read_now=marks)
         return Result(stage, key, final, manifest)
@@ -263,8 +265,14 @@ class Store:
         return holds_checkpoint(self._partial(stage, key))
 
     def link_results(self, result: Result, kind: str) -> Path:
-        """Point ``WORKSPACE/results`` at the exports in use."""
-        link, aside = link_to(self.root, "results", result.folder / kind, result.stage)
+        """Point ``WORKSPACE/results`` at the exports in use; where they are, if the disk can't."""
+        try:
+            link, aside = link_to(self.root, "results", result.folder / kind, result.stage)
+        except OSError as error:
+            if error.errno not in NO_LINKS:
+                raise
+            self._say(f"The disk knows no links, so there is no {self.root / 'results'}.")
+            return result.folder / kind
         if aside is not None:
             self._say(f"{link} was no link of ours; it was moved to {aside.name}.")
         return link
@@ -288,7 +296,10 @@ class Store:
 
     @staticmethod
     def _recover(folder: Path) -> None:
-        """Undo what a kill between the two renames of a replacement left (see `commit`)."""
+        """Undo what a kill between the steps of `commit` left."""
+        for scratch in folder.glob(f"*/{SCRATCH}"):
+            if scratch.parent.suffix != PARTIAL:
+                remove(scratch)
         for displaced in folder.glob(f"*{DISPLACED}"):
             final = displaced.with_name(displaced.name.removesuffix(DISPLACED))
             if is_there(final):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -43,6 +44,18 @@ def test_a_copy_with_links_turned_into_folders(run: Any, toys: Path) -> None:
     assert (toys / "w" / "results" / "viewer.html").is_file()
     assert not list((toys / "w").glob("results.*"))
     assert not list((toys / "w").glob("*/*.quarantined*"))
+
+
+def test_a_disk_that_knows_no_links(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    assert run() == RAN
+    assert "The disk knows no links" in capsys.readouterr().err
+    assert not (toys / "w" / "results").exists()
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "link", "loop"])

@@ -315,6 +315,20 @@ def test_workspace_remembers_its_photographs(run: Any) -> None:
     assert run("read.keep=1", images=(), stages=["read", "scale"])["read"] == "ran"
 
 
+def test_photographs_are_read_again_with_other_settings(run: Any) -> None:
+    run()
+    assert "read" not in run(images=())
+    assert run("read.keep=1", images=())["read"] == "ran"
+    assert run("scale.factor=5", images=())["read"] == "cached"  # the preset's setting again
+
+
+def test_settings_that_change_nothing_are_said(run: Any) -> None:
+    ears = Ears()
+    run()
+    assert run("read.keep=1", images=(), stages=["publish"], reporter=ears) == {"publish": "cached"}
+    assert any("given for 'read' change nothing in this run" in text for text in ears.heard)
+
+
 def test_what_prepares_runs_after_what_reads_and_before_the_rest(
     run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

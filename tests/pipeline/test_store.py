@@ -22,6 +22,7 @@ from pipeline.files import (
     write_json,
 )
 from pipeline.store import Result, Store
+from pipeline.store import store as store_module
 
 KEY = "a" * 64
 FIGURES: dict[str, Any] = {"key_material": {}, "summary": {}, "warnings": []}
@@ -162,3 +163,35 @@ def test_half_a_checkpoint_is_none(tmp_path: Path) -> None:
     assert not store.has_checkpoint("fit", "c" * 64)
     (scratch / "fit.npz").write_text("whole")
     assert store.has_checkpoint("fit", "c" * 64)
+
+
+def test_a_run_that_is_killed_while_it_commits_can_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    (store.begin("fit", KEY) / "scratch" / "fit.npz").write_text("whole")
+
+    def killed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module, "write_sealed", killed)
+        with pytest.raises(KeyboardInterrupt):
+            put(store, 1)
+    store.discard_outputs("fit", KEY)
+    assert store.has_checkpoint("fit", KEY)
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module, "remove", killed)
+        with pytest.raises(KeyboardInterrupt):
+            put_beside_scratch(store, 2)
+    with store.lock("fit", print):
+        assert value_of(store) == 2
+        assert not (tmp_path / "fit" / KEY[:12] / "scratch").exists()
+
+
+def put_beside_scratch(store: Store, value: int) -> Result:
+    """As `put`, into the folder as it is."""
+    folder = store.root / "fit" / f"{KEY[:12]}.partial"
+    (folder / "metrics").mkdir()
+    Metrics({"value": value}).save(folder / "metrics")
+    return store.commit("fit", KEY, dict(FIGURES), ["metrics"])
