@@ -92,7 +92,7 @@ def agreed_numbers(
         cameras, depths: of each, with z-depth [H, W], 0 where unknown.
         options: of the rows.
     """
-    read = {dentition.name: dentition for dentition in teeth.chosen if not dentition.mirrored}
+    read = {dentition.name: dentition for dentition in teeth.chosen}
     dentitions = [read.get(view.name) for view in views]
     if sum(dentition is not None for dentition in dentitions) < 2:
         return teeth

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 
+from pipeline.artifacts.dental.fdi import ALL_TEETH, THE_NUMBERS
 from pipeline.stage import StageConfig, runtime
 from pipeline.untrusted.paths import GivenPath, user_path
 from stages.init.dental.numbering.arch_options import ArchOptions
@@ -178,6 +180,14 @@ class ToothConfig(StageConfig):
     x: float = Field(description="a point on the crown, pixels of that photograph (upright)")
     y: float = Field(description="a point on the crown, pixels of that photograph (upright)")
     tooth: int = Field(ge=11, le=85, description="its FDI number")
+
+    @field_validator("tooth")
+    @classmethod
+    def _known(cls, value: int) -> int:
+        if value not in ALL_TEETH:
+            why = f"it is no tooth's number; {THE_NUMBERS}"
+            raise PydanticCustomError("tooth", "{why}", {"why": why})
+        return value
 
 
 class DentalConfig(StageConfig):

@@ -120,7 +120,7 @@ def few_of_teeth(context: StageContext, views: Views) -> bool:
     ):
         return False
     chosen = labelled_teeth(context, views).chosen
-    shown = {found.name for found in chosen if found.all_crowns and not found.mirrored}
+    shown = {found.name for found in chosen if found.all_crowns}
     return shown >= {view.name for view in views.views}
 
 

@@ -74,7 +74,7 @@ def tooth_places(
     found: dict[tuple[str, int], list[Array]] = {}
     for view, camera, depth in zip(views, cameras, depths, strict=True):
         dentition = read.get(view.name)
-        if dentition is None or dentition.mirrored:
+        if dentition is None:
             continue
         factor = np.array([view.width, view.height]) / np.array(dentition.size)
         for crown in dentition.all_crowns:

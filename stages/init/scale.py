@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,7 @@ _FROM_MEDIAN = 1.4826
 def mm_per_unit(
     view: View, camera: Camera, depth: npt.NDArray[np.float32], start: tuple[float, float],
     end: tuple[float, float], mm: float,
+    in_depth: Callable[[Array], Array] = lambda pixel: pixel,
 ) -> tuple[float, float]:  # fmt: skip
     """How many millimetres one unit of the world is, and how sure that is.
 
@@ -54,6 +56,7 @@ def mm_per_unit(
         camera, depth: its camera, and z-depth [H, W], 0 where unknown.
         start, end: where the length begins and ends, x and y in pixels of the upright photograph.
         mm: its length.
+        in_depth: from a pixel of the view to that of `depth` which shows the same.
 
     Returns:
         Millimetres per unit, and their relative standard deviation.
@@ -69,6 +72,7 @@ def mm_per_unit(
                 f"init.length.{name}: {point[0]:g}, {point[1]:g} is outside the photograph "
                 f"{view.source_name or view.name}."
             )
+        pixel = in_depth(pixel)
         known = depths_near(depth, pixel)
         if not len(known):
             raise RequestError(

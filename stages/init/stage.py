@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 42
+    version = 43
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -174,6 +174,7 @@ def _from_features(context: StageContext, views: Views) -> None:
     """By features, or by teeth where these link photographs that features don't."""
     from pipeline.kernels.threads import side_by_side
     from stages.init.dental.choice import ByTeeth, neither
+    from stages.init.dental.read import turned_as_said
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
@@ -181,11 +182,12 @@ def _from_features(context: StageContext, views: Views) -> None:
     config: InitConfig = context.config
     free = config.method == "auto"
     by_teeth, options = ByTeeth(context, views), _classical_options(config)
+    upright = turned_as_said(context, views)
     focals = with_focals(views.views, config.focal)
     told: list[str] = []
     # what either way needs is loaded meanwhile; pycolmap in this thread, where signals can wait
     teeth_first, dense = side_by_side(
-        lambda: free and by_teeth.is_first(focals, options),
+        lambda: free and by_teeth.is_first(upright.views, focals, options),
         lambda: import_module("stages.init.densify"),
         context.threads,
     )
@@ -199,7 +201,7 @@ def _from_features(context: StageContext, views: Views) -> None:
         refinement = replace(refinement, unroll=False)
     try:
         placement = place_classical(
-            list(views.views), focals, config.focal is not None, views.ordered,
+            list(upright.views), focals, config.focal is not None, views.ordered,
             least_views(len(views), config.min_views_fraction), options, refinement,
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=told.append,
@@ -239,11 +241,13 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 def _from_known_cameras(context: StageContext, views: Views) -> None:
     from pipeline.geometry.models.known_cameras import matching_cameras, read_cameras
     from stages.init.densify import densify
+    from stages.init.dental.read import refuse_mirrored
     from stages.init.place import place_known
 
     config: InitConfig = context.config
     cameras, units = read_cameras(_camera_files(context.sources), CAMERAS)
     known = matching_cameras(cameras, views.views, CAMERAS)
+    refuse_mirrored(context, views, known)
     units = units if config.units == "auto" else config.units
     if config.points == "model":
         from stages.init.model_start import from_model
@@ -289,12 +293,14 @@ def _teeth_are_wide_apart(
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:
+    from stages.init.dental.read import turned_as_said
     from stages.init.place import photo_name, with_focals
     from stages.init.write import save_all
     from stages.pointmaps.predict import predict_pointmaps
     from stages.pointmaps.quick_start import quick_start
 
     config: InitConfig = context.config
+    given, views = views, turned_as_said(context, views)
     pairs = predict_pointmaps(
         views.views, views.ordered, options, context.progress, context.threads
     )
@@ -316,5 +322,5 @@ def _from_pointmaps(context: StageContext, views: Views, options: PointmapOption
         for view in (by_name[camera.name] for camera in start.cameras)
     )
     cameras = Cameras(start.cameras, provisional=True)  # `align` makes them better
-    save_all(context, views, placed, cameras, list(start.depths), start.points, pairs)
+    save_all(context, given, placed, cameras, list(start.depths), start.points, pairs)
     context.summarize(method=options.method, pairs=len(pairs))

@@ -17,6 +17,7 @@ from pipeline.artifacts.space.scale import Scale, Source
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import StageContext
+from stages.dentition.working import outline_in_view
 from stages.init.config import InitConfig
 from stages.init.mouth import mouth_frame, primary_places, textbook_scale, tooth_places
 from stages.init.scale import mm_per_unit, photo_named
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from pipeline.artifacts.teeth import Teeth
 
 Map = npt.NDArray[np.float32]
+#: [2] pixel.
+Place = npt.NDArray[np.float64]
 
 
 def save_matches(context: StageContext, links: Links, most: int) -> None:
@@ -88,6 +91,7 @@ def _agreed(
         return None
     teeth = agreed_numbers(read, placed, cameras.cameras, depths)
     seen, by_name = {view.name for view in placed}, views.by_name()
+    by_name |= {v.name: v for v in placed if _turned_over(v, by_name[v.name])}
     drawn = {
         dentition.name: labelled_overlay(by_name[dentition.name].image, dentition)
         for dentition in teeth.chosen if dentition.name in seen
@@ -129,6 +133,15 @@ def _turned_over(view: View, before: View) -> bool:
     return bool(sides[0] != sides[1])
 
 
+def place_in(placed: View, view: View, pixel: Place) -> Place:
+    """A pixel of a photograph as it was taken, in the picture that its camera belongs to."""
+    if _turned_over(placed, view):
+        pixel = np.array([view.width - pixel[0], pixel[1]])
+    if placed.lens_taken_out == view.lens_taken_out:
+        return pixel
+    return np.asarray(outline_in_view(pixel[None], (view.width, view.height), placed)[0])
+
+
 def _scaled(
     context: StageContext, views: Views, placed: tuple[View, ...], cameras: Cameras,
     depths: list[Map],
@@ -143,11 +156,10 @@ def _scaled(
             f"init.length.photo: {length.photo} could not be placed, so that nothing can be "
             "measured in it. Name another photograph."
         )
-    camera, depth = cameras.cameras[number], depths[number]
-    if _turned_over(placed[number], view):  # start and end are in the photograph as it was taken
-        camera = replace(camera, cx=camera.width - camera.cx)
-        depth = np.ascontiguousarray(depth[:, ::-1])
-    factor, deviation = mm_per_unit(view, camera, depth, length.start, length.end, length.mm)
+    factor, deviation = mm_per_unit(
+        view, cameras.cameras[number], depths[number], length.start, length.end, length.mm,
+        lambda pixel: place_in(placed[number], view, pixel),
+    )  # fmt: skip
     context.summarize(
         mm_per_unit=round(factor, 4), scale_uncertainty_percent=round(100 * deviation, 2)
     )

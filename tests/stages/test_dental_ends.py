@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.artifacts.dental.fdi import JAWS
 from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.ends import MOST_COST, end_labels, ends_cost, hidden_at_ends
-from stages.init.dental.numbering.hypotheses import row_defects
+from stages.init.dental.numbering.hypotheses import row_defects, row_pairs
 from stages.init.dental.numbering.sightings import SeenRow
 from stages.init.dental.template import LANDMARKS_A_JAW, PAPILLA, POSITIONS, ZENITH
 
@@ -85,3 +86,17 @@ def test_other_labels_of_the_ends() -> None:
     assert set(end_labels((0, 1, 2, 5), 1)) == {(0, 1, 2, 3), (0, 1, 2, 4)}
     assert end_labels((3, NO_TOOTH, NO_TOOTH, 6), 2) == []
     assert end_labels((3, 4), 2) == []
+
+
+def test_jaws_whose_looks_contradict_each_other_are_not_left_without_a_name() -> None:
+    """Anatomy would allow neither row beside the other."""
+    rows = []
+    for jaw, first in zip(JAWS, (0, 7), strict=True):
+        row = row_of([0, 1, 2, 3, 4, 5])
+        looks = np.full((6, POSITIONS), -30.0)
+        looks[np.arange(6), first + np.arange(6)] = 0.0
+        middles = np.stack([row.lefts + row.rights, np.zeros(6)], 1) / 2
+        rows.append(replace(row, jaw=jaw, looks=looks, middles=middles))
+    upper, lower = rows
+    assert row_pairs((upper, lower), 16)
+    assert row_pairs((upper, upper), 16)[0] == ((0, 1, 2, 3, 4, 5),) * 2

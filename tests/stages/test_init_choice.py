@@ -231,3 +231,19 @@ def test_a_sounding_tells_what_features_can_link(tmp_path):
         ClassicalOptions(), seed=0, threads=1, scratch=tmp_path,
     )  # fmt: skip
     assert sounding.linked == 3 and sounding.features is None
+
+
+def test_features_see_what_is_said_to_be_mirrored_turned_over(tmp_path, monkeypatch):
+    seen = []
+
+    def placed(views, *_, **__):
+        seen.extend(views)
+        raise ReconstructionError("0 of 3 photographs could be placed.")
+
+    monkeypatch.setattr("stages.init.place.place_classical", placed)
+    said = {CORRECTIONS: write(tmp_path / "teeth.yaml", "photographs: {p1.jpg: {mirrored: true}}")}
+    with pytest.raises(ReconstructionError):
+        auto(tmp_path / "w", 3, read_teeth(), said, method="colmap")
+    for number, (view, given) in enumerate(zip(seen, photographs(3).views, strict=True)):
+        expected = given.mirrored() if number == 1 else given
+        np.testing.assert_array_equal(view.image, expected.image)

@@ -1,6 +1,5 @@
 """When depth is completed by the shape of teeth, and what of it is used."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,9 +136,3 @@ def test_an_order_of_other_photographs_stops_nothing(tmp_path):
     dense = stereo(np.ones(SIZE, bool))
     found = densify.completed_by_teeth(asked, photographs(), cameras(), lambda: dense)
     assert found == (dense, False)
-
-
-def test_mirror_images_are_not_completed(tmp_path):
-    teeth = read_teeth()
-    turned = replace(teeth, views=(replace(teeth.views[0], mirrored=True), *teeth.views[1:]))
-    assert not densify.few_of_teeth(context(tmp_path, turned), photographs())

@@ -1,6 +1,7 @@
 """Cameras and lengths that the user knows: read, matched to photographs, undistorted, used."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,7 @@ from stages.init.sfm.triangulate import (
     triangulate,
 )
 from stages.init.stage import InitConfig, InitStage
+from stages.init.write import place_in
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
 TRUTH = json.loads((SAMPLES / "transforms.json").read_text())
@@ -321,6 +323,22 @@ def test_length_that_cannot_be_measured_is_refused():
         mm_per_unit(view, camera, 0 * depth, (100, 100), (300, 100), 8.0)
     with pytest.raises(RequestError, match="the same place"):
         mm_per_unit(view, camera, depth, (100, 100), (100, 100), 8.0)
+
+
+def test_a_length_is_of_the_photograph_before_its_lens_was_taken_out() -> None:
+    """Two spots of a plane, clicked where a barrel lens shows them."""
+    view = View("a", np.zeros((300, 400, 3), np.float32), source_size=(400, 300))
+    straight = replace(view, lens_taken_out="SIMPLE_RADIAL 400 300 320 200 150 -0.15")
+    camera = Camera("a", 400, 300, 320, 320, 200, 150, np.eye(4))
+    depth = np.full((300, 400), 2, np.float32)
+    bent = 160 * (1 - 0.15 * 0.5**2)  # of a spot 160 pixels from the middle, half the focal length
+    ends = (200 - bent, 150.0), (200 + bent, 150.0)
+    units = 2 * 320 / 320
+    factor, _ = mm_per_unit(
+        view, camera, depth, *ends, 10.0, lambda pixel: place_in(straight, view, pixel)
+    )
+    assert factor == pytest.approx(10.0 / units, rel=1e-4)
+    assert mm_per_unit(view, camera, depth, *ends, 10.0)[0] > 1.03 * factor
 
 
 def test_uncertainty_of_a_length_covers_what_clicks_and_depth_do() -> None:

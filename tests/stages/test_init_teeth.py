@@ -212,7 +212,7 @@ def test_a_photograph_that_was_turned_over_is_named(tmp_path, monkeypatch):
 
 def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):
     """Where one end is nearer than the other it matters which side is which."""
-    length = {"mm": 5.0, "photo": "p1", "start": [20, 40], "end": [60, 40]}
+    length = {"mm": 5.0, "photo": "p1", "start": [20.5, 40], "end": [60.5, 40]}
     ramp = np.broadcast_to(np.linspace(90, 150, SIZE[1], dtype=np.float32), SIZE)
 
     def millimetres(name, depth, **more):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.artifacts.views import Views
+from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import StageContext
 from stages.init.dental.read import labelled_teeth
@@ -80,10 +81,13 @@ class ByTeeth:
         enough = len(self.views) / 3 if self.views.ordered else len(self.views)
         return len(rolls) >= max(enough, 1) and max(rolls) < UPRIGHT
 
-    def is_first(self, focals: list[float | None], options: ClassicalOptions) -> bool:
+    def is_first(
+        self, views: Sequence[View], focals: list[float | None], options: ClassicalOptions
+    ) -> bool:
         """Few photographs that features won't link: finding that out would take longest of all.
 
         Args:
+            views: as features see them.
             focals: of each view in pixels, or None.
             options: of the attempt by features.
         """
@@ -91,9 +95,9 @@ class ByTeeth:
         if len(self.views) > SOUNDED_VIEWS or not shown:
             return False
         sounding = sound(
-            [view.gray() for view in self.views.views],
-            [view.valid() for view in self.views.views], focals, self.views.ordered, options,
-            seed=self.context.seed, threads=self.context.threads, scratch=self.context.scratch,
+            [view.gray() for view in views], [view.valid() for view in views], focals,
+            self.views.ordered, options, seed=self.context.seed, threads=self.context.threads,
+            scratch=self.context.scratch,
         )  # fmt: skip
         self.features = sounding.features
         return sounding.linked < min(ENOUGH, len(shown))

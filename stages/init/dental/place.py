@@ -19,7 +19,7 @@ from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.read import labelled_teeth
+from stages.init.dental.read import labelled_teeth, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
@@ -45,9 +45,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
     """
     config: InitConfig = context.config
     read = labelled_teeth(context, views)
-    said = {dentition.name for dentition in read.views if dentition.mirrored}
-    given = views
-    views = replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
+    given, views = views, turned_as_said(context, views)
     dentitions = chosen_dentitions(read, views)
     if config.dental.order is not None:
         dentitions = [d or e for d, e in zip(dentitions, read.views, strict=True)]
@@ -261,10 +259,12 @@ def masked(view: View, depth: Map) -> View:
 def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
     """Figures of the teeth found, for the summary."""
     placed = [view for view in teeth.fit.views if view is not None]
+    # no other numbering of a few crowns may have been worth a try
+    margin = {"label_margin": round(teeth.fit.margin, 1)} if np.isfinite(teeth.fit.margin) else {}
     return {
         "upper_teeth": len({tooth for view in placed for tooth in view.upper if tooth}),
         "lower_teeth": len({tooth for view in placed for tooth in view.lower if tooth}),
-        "label_margin": round(teeth.fit.margin, 1),
+        **margin,
         "teeth_confidence": round(teeth.fit.confidence, 3),
         "landmark_error_px": round(float(np.median([view.error for view in placed])), 2),
     }

@@ -16,7 +16,7 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import said_by_cameras
 from pipeline.artifacts.teeth import Dentition, moved_polygons
 from pipeline.artifacts.views import View, Views
-from pipeline.errors import ReconstructionError, RequestError
+from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
 from pipeline.geometry.graph import Pair
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
@@ -91,13 +91,6 @@ def from_known_teeth(
         as_pinhole(view, known[view.name], CAMERAS) for view in views.views if view.name in known
     ]
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
-    by_name = labelled_teeth(context, views).by_name()
-    if turned := [photo_name(view) for view in placed if _mirrored(by_name.get(view.name))]:
-        raise RequestError(
-            f"{', '.join(turned)} {'is' if len(turned) == 1 else 'are'} said to be mirrored, but "
-            "init.cameras gives a camera for the picture as it is. Take `mirrored` out of the "
-            "corrections, or leave init.cameras out."
-        )
     posed = replace(views, views=tuple(placed))
     held = held_teeth(context, posed, cameras)
     # with cameras that are exact the charts may go on as far as they are
@@ -185,10 +178,6 @@ def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -
     if config.dental.gum_height is None:
         surface = replace(surface, gum_height=GUM_HEIGHT)
     return HeldTeeth(centred, [photo_name(view) for view in views.views], dentitions, surface)
-
-
-def _mirrored(dentition: Dentition | None) -> bool:
-    return bool(dentition and dentition.mirrored)
 
 
 def moved(dentition: Dentition, centred: CentredView) -> Dentition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import replace
 
 from pipeline.artifacts.dental.corrections import (
@@ -16,6 +17,34 @@ from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
 from pipeline.stage import StageContext
 from stages.dentition.corrections import apply_corrections
+
+
+def turned_as_said(context: StageContext, views: Views) -> Views:
+    """The views; those of which a person has said that they are mirror images, turned over."""
+    if CORRECTIONS not in context.sources or not context.has("teeth"):
+        return views
+    said = {seen.name for seen in labelled_teeth(context, views).views if seen.mirrored}
+    return replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
+
+
+def refuse_mirrored(context: StageContext, views: Views, known: Container[str]) -> None:
+    """Refuse that a photograph with a known camera is said to be a mirror image.
+
+    Args:
+        known: names of views with a camera.
+    """
+    turned = turned_as_said(context, views)
+    said = [
+        view.source_name or view.name
+        for view, other in zip(views.views, turned.views, strict=True)
+        if view is not other and view.name in known
+    ]
+    if said:
+        raise RequestError(
+            f"{', '.join(said)} {'is' if len(said) == 1 else 'are'} said to be mirrored, but "
+            "init.cameras gives a camera for the picture as it is. Take `mirrored` out of the "
+            "corrections, or leave init.cameras out."
+        )
 
 
 def labelled_teeth(context: StageContext, views: Views) -> Teeth:

@@ -305,7 +305,10 @@ def looks_cost(row: SeenRow, labels: Labels) -> float:
 
 
 def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
-    """The labels of both rows of a view that look likeliest and that anatomy allows."""
+    """The labels of both rows of a view that look likeliest and that anatomy allows.
+
+    Where it allows none, the looks of one row are wrong: the likeliest, for the others to correct.
+    """
     upper, lower = rows
     best = [best_rows(row.looks, count, LOOKS, row.said_wholes) for row in rows]
     likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
@@ -316,7 +319,7 @@ def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
             pairs.append((a, b))
             if len(pairs) == count:
                 break
-    return pairs
+    return pairs or [pair for _, pair in likeliest[:count]]
 
 
 def _jaw_shift(upper: SeenRow, lower: SeenRow, a: Labels, b: Labels) -> float | None:
