@@ -64,6 +64,14 @@ class InitStage(Stage):
             files[CORRECTIONS] = said
         return files
 
+    def backend(self, config: Any) -> str:
+        options = _pointmap_options(config) if config.cameras is None else None
+        if options is None:
+            return ""
+        from stages.pointmaps.predict import model_code
+
+        return model_code(options)
+
     def findings(self) -> Iterable[Finding]:
         from pipeline.stage import Finding
         from stages.pointmaps.predict import available, cards

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from pipeline.artifacts.pointmaps import PointmapPair
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError, nearest
+from pipeline.installed import library_version
 from stages.pointmaps.files import match_names, pointmap_files, read_pairs
 from stages.pointmaps.graph import choose_graph, scene_pairs
 from stages.pointmaps.interface import ModelCard, PreparedView, ViewPrediction
@@ -69,6 +71,23 @@ def source_files(options: PointmapOptions) -> dict[str, Path]:
         pattern = "*.npz" if options.method == "files" else "*"
         return {path.name: path for path in sorted(chosen.glob(pattern)) if path.is_file()}
     return {"checkpoint": chosen} if chosen.is_file() else {}
+
+
+def model_code(options: PointmapOptions) -> str:
+    """Which code answers: model, versions of its package and of torch, checkout; "" for files.
+
+    It belongs to the key of what is computed with it.
+    """
+    if options.method == "files":
+        return ""
+    package = options.package or adapter(options.method).card.package
+    versions = ", ".join(f"{name} {library_version(name)}" for name in (package, "torch"))
+    if options.package_folder is None:
+        return f"{options.method} ({versions})"
+    digest = hashlib.sha256()
+    for path in sorted((options.package_folder / package).rglob("*.py")):
+        digest.update(path.read_bytes())
+    return f"{options.method} ({versions}, checkout {digest.hexdigest()[:12]})"
 
 
 def predict_pointmaps(

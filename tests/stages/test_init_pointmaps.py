@@ -118,3 +118,21 @@ def test_which_model_is_asked(monkeypatch, tmp_path):
     assert InitStage().sources(config, {}) == {}
     with pytest.raises(RequestError, match="would not use it"):
         InitStage().sources(InitConfig(method="dust3r", cameras="x"), {})
+
+
+def test_another_version_of_a_model_is_another_key(tmp_path, monkeypatch):
+    package = tmp_path / "checkout" / "mast3r"
+    package.mkdir(parents=True)
+    (package / "model.py").write_text("layers = 1\n")
+    config = InitConfig(method="mast3r", pointmap={"package_folder": str(tmp_path / "checkout")})
+    before = InitStage().backend(config)
+    assert before.startswith("mast3r (") and "torch" in before
+    assert InitStage().backend(config) == before
+    (package / "model.py").write_text("layers = 2\n")
+    after = InitStage().backend(config)
+    assert after != before
+    monkeypatch.setattr("stages.pointmaps.predict.library_version", lambda name: "0.0")
+    assert InitStage().backend(config) != after
+    assert InitStage().backend(InitConfig()) == ""
+    files = InitConfig(method="files", pointmap={"files": str(tmp_path)})
+    assert InitStage().backend(files) == ""
