@@ -24,7 +24,9 @@ DEFAULT_PRESET = "dentalsplat"
 #: Parts and letters of a setting's name; presets that extend each other; faults that are explained.
 _MOST_PARTS, _LONGEST_NAME, _LONGEST_CHAIN, _MOST_FAULTS = 8, 200, 20, 5
 #: pydantic's names of what a value may be, in the place of a fault
-_ALTERNATIVE = re.compile(r"(literal\[.*\]|constrained-\w+|function-.*|int|float|bool|str|none)$")
+_ALTERNATIVE = re.compile(
+    r"((literal|tuple)\[.*\]|constrained-\w+|function-.*|int|float|bool|str|none)$"
+)
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -255,7 +257,10 @@ def _unknown_section(
 
 
 def _one_each(faults: Sequence[Any]) -> list[Any]:
-    """What is wrong with a value that may be one thing or another, said of both at once."""
+    """What is wrong with a value that may be one thing or another, said of both at once.
+
+    Of a list with a wrong entry it is not said that it might have been something else.
+    """
     found: dict[tuple[Any, ...], Any] = {}
     for fault in faults:
         place = tuple(part for part in fault["loc"] if not _ALTERNATIVE.match(str(part)))
@@ -263,7 +268,8 @@ def _one_each(faults: Sequence[Any]) -> list[Any]:
         other = str(fault["msg"]).removeprefix("Input should be ")
         if other not in first["msg"]:
             first["msg"] = f"{first['msg']}, or {other}"
-    return list(found.values())
+    wholes = {place[:n] for place in found for n in range(len(place))}
+    return [fault for place, fault in found.items() if place not in wholes]
 
 
 def _explain(model: type[BaseModel], section: str, error: Any) -> str:

@@ -44,7 +44,7 @@ class Crown:
         doubtful: its outline is weak: at the border of the image, or hardly told from the rest.
         outline: [K, 2] polygon around it.
         score: 0..1, how sure the reader is that this is one crown.
-        numbers: FDI number -> probability by this photograph alone (those of .001 and more).
+        numbers: FDI number -> probability by this photograph alone (those of .0001 and more).
         number: FDI number given to it, 0: none.
         doubt: 0..1 that `number` is wrong.
     """

@@ -32,10 +32,12 @@ class View:
         focal_px: focal-length prior in pixels of `image`, or None where nothing is known.
         timestamp: seconds from the start of the video, or None.
         taken_after: by the cameras' clocks, seconds after the first photograph of the case was
-            taken, or None. The date itself is not kept.
+            taken (of those that are not held out), or None. The date itself is not kept.
         lens_taken_out: where the image has been undistorted, the lens that it had before, as a line
             of COLMAP's ``cameras.txt`` without number (model, width, height, parameters);
             `working_from_source` then leads to pixels of the image before.
+        turned_over: the photograph is a mirror image, and `image` is turned back: left is where the
+            photograph has right.
     """
 
     name: str
@@ -49,6 +51,7 @@ class View:
     timestamp: float | None = None
     taken_after: float | None = None
     lens_taken_out: str = ""
+    turned_over: bool = False
 
     @property
     def width(self) -> int:
@@ -75,6 +78,8 @@ class View:
             return np.eye(3)
         upright_from_source = np.eye(3)
         turn = np.sign(np.round(self.working_from_source[:2, :2], 9))
+        if self.turned_over:
+            turn[0] *= -1
         upright_from_source[:2, :2] = turn
         upright_from_source[:2, 2] = -np.minimum(turn, 0) @ self.source_size
         return np.asarray(self.working_from_source @ np.linalg.inv(upright_from_source))
@@ -91,6 +96,7 @@ class View:
             image=np.ascontiguousarray(self.image[:, ::-1]),
             mask=None if self.mask is None else np.ascontiguousarray(self.mask[:, ::-1]),
             working_from_source=turned @ self.working_from_source,
+            turned_over=not self.turned_over,
         )
 
     def gray(self) -> npt.NDArray[np.uint8]:
@@ -135,6 +141,7 @@ class Views(Artifact):
                 (folder / "masks").mkdir(exist_ok=True)
                 mask = np.where(view.mask, np.uint8(255), np.uint8(0))
                 write_png(folder / "masks" / f"{view.name}.png", mask)
+            turned = {"turned_over": True} if view.turned_over else {}
             entries.append(
                 {
                     "name": view.name,
@@ -149,6 +156,7 @@ class Views(Artifact):
                     "timestamp": view.timestamp,
                     "taken_after": view.taken_after,
                     "lens_taken_out": view.lens_taken_out,
+                    **turned,
                 }
             )
         text = json.dumps({"ordered": self.ordered, "views": entries}, indent=1)
@@ -175,6 +183,7 @@ class Views(Artifact):
                     timestamp=entry["timestamp"],
                     taken_after=entry.get("taken_after"),
                     lens_taken_out=entry.get("lens_taken_out", ""),
+                    turned_over=entry.get("turned_over", False),
                 )
             )
         return cls(views=tuple(views), ordered=meta["ordered"])

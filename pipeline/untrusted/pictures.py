@@ -192,6 +192,11 @@ def gray(data: bytes) -> npt.NDArray[np.uint8]:
     return np.asarray(found, np.uint8)
 
 
+def same_shape(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
+    """Are two sizes equal up to scale, within their rounding to whole pixels?"""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= max(*a, *b)
+
+
 def bare_png(data: bytes) -> bytes:
     """A PNG with nothing but what its first picture is made of: no texts, profiles, animation."""
     kept, place = [data[:8]], 8

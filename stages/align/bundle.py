@@ -47,7 +47,8 @@ class BundleOptions:
             Noise of the pointmaps alone leaves matches a factor 1.2 to 1.8; where they are bent
             by 2 % it is 2.2 to 4.5, and matches are worth more than they.
         free_focals: matches tell focal lengths worse than pointmaps do where views are few.
-        shared_focal: all views have one focal length.
+        shared_focal: views of one size and principal point have one lens; where focal lengths
+            stay, of one focal length too.
     """
 
     features: int = 3000
@@ -230,16 +231,19 @@ def _model(
 
     model = pycolmap.Reconstruction()
     slots: list[dict[int, int]] = []
+    lenses: dict[tuple[float, ...], int] = {}
     for k, camera in enumerate(cameras, start=1):
         used = sorted({feature for track in tracks for view, feature in track if view == k - 1})
         slots.append({feature: slot for slot, feature in enumerate(used)})
-        lens = 1 if options.shared_focal else k
+        focal = (camera.fx + camera.fy) / 2
+        same = (camera.width, camera.height, camera.cx, camera.cy)
+        own = () if options.free_focals else (focal,)
+        lens = lenses.setdefault((*same, *own), k) if options.shared_focal else k
         if lens == k:
             model.add_camera_with_trivial_rig(
                 pycolmap.Camera(
                     camera_id=lens, model="SIMPLE_PINHOLE", width=camera.width,
-                    height=camera.height,
-                    params=[(camera.fx + camera.fy) / 2, camera.cx, camera.cy],
+                    height=camera.height, params=[focal, camera.cx, camera.cy],
                 )
             )  # fmt: skip
         image = pycolmap.Image(

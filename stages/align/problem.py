@@ -30,7 +30,7 @@ class AlignOptions:
         huber: residual from which the loss is linear, in median residuals; 0: everywhere, as in
             DUSt3R.
         free_focals, free_poses: what may move besides depths and similarities.
-        shared_focal: all views have one focal length, relative to their long side.
+        shared_focal: where focal lengths may move, all views have one, relative to their long side.
         free_pairs: a pair's frame may differ from the camera of its first view, as in DUSt3R.
     """
 

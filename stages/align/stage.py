@@ -36,7 +36,9 @@ class AlignConfig(StageConfig):
         "auto", description="Focal lengths stay; auto: where the photographs' EXIF data say them."
     )
     shared_focal: Literal["auto", "always", "never"] = Field(
-        "auto", description="One focal length for all photographs; auto: for the frames of a video."
+        "auto",
+        description="One focal length, relative to the long side, for all photographs; auto: for "
+        "the frames of a video and photographs numbered like them.",
     )
     iterations: int = Field(
         30, ge=0, le=10_000, description="Steps of the global alignment at most."
@@ -125,7 +127,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 6
+    version = 7
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")

@@ -92,6 +92,8 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
     mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
     if dentition.mirrored:  # places are pixels of the photograph as it was taken
         dentition = mirrored_dentition(dentition)
+    if view.turned_over:
+        view = view.mirrored()
     crowns = list(dentition.all_crowns)
     moved = False
     for k, change in enumerate(photo.crowns):

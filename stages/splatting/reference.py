@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-#: as `raster.ALPHA_MAX`, `raster.TRANSMITTANCE_MIN` and `rasterizer.LOW_PASS`, `ALPHA_CUT`
+#: as `compositing.ALPHA_MAX`, `TRANSMITTANCE_MIN` and `rasterizer.LOW_PASS`, `ALPHA_CUT`
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 LOW_PASS = 0.3

@@ -33,7 +33,11 @@ _SHARPNESS_SIDE = 512
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Settings of `choose`, as in `config.TeethConfig`."""
+    """Settings of `choose`: those of `config.TeethConfig`, and one more.
+
+    Attributes:
+        apart_gap: the jaws are apart where the gap between them (`Dentition.jaws_apart`) is larger.
+    """
 
     least_crowns: int = 5
     least_extent: float = 0.3

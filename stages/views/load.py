@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -201,9 +201,26 @@ def drop_duplicates(
     return list(first.values())
 
 
-def prepared_views(loaded: Sequence[Loaded], prefix: str = "") -> tuple[View, ...]:
-    """The views of an artifact, numbered in order: ``000``, ``001``, ... after the prefix."""
-    times = [item.taken_at for item in loaded if item.taken_at is not None]
+def first_taken(loaded: Iterable[Loaded]) -> float | None:
+    """When the first of the pictures was taken, by the camera's clock; None where none tells."""
+    return min((item.taken_at for item in loaded if item.taken_at is not None), default=None)
+
+
+def prepared_views(
+    loaded: Sequence[Loaded], prefix: str = "", start: float | None = None
+) -> tuple[View, ...]:
+    """The views of an artifact, numbered in order: ``000``, ``001``, ... after the prefix.
+
+    Args:
+        loaded: what they show.
+        start: when the time begins that they are given, by the camera's clock; None: with the
+            first of them.
+    """
+    start = first_taken(loaded) if start is None else start
+
+    def after(taken_at: float | None) -> float | None:
+        return None if taken_at is None or start is None else taken_at - start
+
     return tuple(
         View(
             name=f"{prefix}{number:03d}",
@@ -215,7 +232,7 @@ def prepared_views(loaded: Sequence[Loaded], prefix: str = "") -> tuple[View, ..
             source_sha256=item.source_sha256,
             focal_px=item.picture.focal_px,
             timestamp=item.timestamp,
-            taken_after=None if item.taken_at is None else item.taken_at - min(times),
+            taken_after=after(item.taken_at),
         )
         for number, item in enumerate(loaded)
     )

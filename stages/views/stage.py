@@ -60,7 +60,7 @@ class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
@@ -96,6 +96,7 @@ class ViewsStage(Stage):
         from stages.views.load import (
             Loaded,
             drop_duplicates,
+            first_taken,
             load_photos,
             load_video,
             prepared_views,
@@ -171,7 +172,8 @@ class ViewsStage(Stage):
         ordered = from_video or (set(names) <= set(files) and is_sequence(names))
         context.save(Views(views, ordered=ordered))
         if held:
-            context.save(HeldOut(prepared_views(held, "h"), ordered=ordered))
+            kept_back = prepared_views(held, "h", first_taken(distinct))
+            context.save(HeldOut(kept_back, ordered=ordered))
             context.summarize(held_out=len(held))
         context.summarize(
             views=len(views),

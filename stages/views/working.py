@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.untrusted.files import UnusableFile
+from pipeline.untrusted.pictures import same_shape
 from stages.views.orientation import make_stored, make_upright, upright_from_stored
 
 Mask = npt.NDArray[np.bool_]
@@ -138,16 +139,11 @@ def _fit_mask(mask: Mask, width: int, height: int, orientation: int) -> Mask:
     """The mask, upright: as it is if it has the upright shape, else turned like the picture."""
     upright = (height, width) if orientation >= 5 else (width, height)
     size = mask.shape[1::-1]
-    if _same_shape(size, upright):
+    if same_shape(size, upright):
         return mask
-    if _same_shape(size, (width, height)):
+    if same_shape(size, (width, height)):
         return make_upright(mask, orientation)
     raise UnusableFile(
         f"has {upright[0]} x {upright[1]} pixels, but its mask {size[0]} x {size[1]}: the mask "
         "must have the picture's proportions"
     )
-
-
-def _same_shape(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
-    """Equal up to scale, within the rounding of the sizes to whole pixels."""
-    return abs(a[0] * b[1] - a[1] * b[0]) <= max(*a, *b)

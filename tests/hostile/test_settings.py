@@ -151,6 +151,15 @@ def test_a_setting_that_is_not_understood_is_refused(text: str, words: str) -> N
     assert words in refused(lambda: load_config(None, [text]))
 
 
+@pytest.mark.parametrize("tooth", [19, 20, 29, 50, 56, 80])
+def test_numbers_that_no_tooth_has_are_refused(tooth: int) -> None:
+    given = f"init.dental.labels=[{{photo: a.jpg, x: 1, y: 2, tooth: {tooth}}}]"
+    said = refused(lambda: load_config(None, [given]))
+    assert said.startswith(f"init.dental.labels.0.tooth={tooth} is not allowed: it is no tooth's")
+    assert "FDI numbers are 11-18, " in said and "string" not in said
+    load_config(None, [given.replace(f"tooth: {tooth}", "tooth: 55")])
+
+
 def test_presets_that_never_end_are_refused(tmp_path: Path) -> None:
     for number in range(300):
         (tmp_path / f"{number}.yaml").write_text(f"extends: {number + 1}.yaml\n")

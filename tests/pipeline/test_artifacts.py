@@ -55,7 +55,12 @@ def samples() -> dict[str, Artifact]:
         "views": Views(
             (
                 View("000", pixels(5, 7, 3), mask, source_name="a.jpg", focal_px=31.5),
-                View("001", pixels(8, 6, 3), working_from_source=np.diag([2.0, 2, 1])),
+                View(
+                    "001",
+                    pixels(8, 6, 3),
+                    working_from_source=np.diag([-2.0, 2, 1]),
+                    turned_over=True,
+                ),
             ),
             ordered=True,
         ),
@@ -213,7 +218,10 @@ def test_a_view_turned_over_shows_the_same_places_on_the_other_side(lying: bool)
         np.testing.assert_allclose([y, x], there, atol=1e-9)
         np.testing.assert_array_equal(over.image[there], image[row, column])
         assert over.mask[there] == mask[row, column]
+    x, y = view.working_place((7, 4))
+    np.testing.assert_allclose(over.working_place((7, 4)), (9 - x, y))
     again = over.mirrored()
+    assert over.turned_over and not again.turned_over
     np.testing.assert_array_equal(again.image, image)
     np.testing.assert_allclose(again.working_from_source, view.working_from_source)
     assert dataclasses.replace(view, mask=None).mirrored().mask is None

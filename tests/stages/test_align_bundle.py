@@ -15,7 +15,15 @@ from pipeline.artifacts.views import View, Views
 from pipeline.geometry.depths import view_depths
 from pipeline.geometry.start import start_from_tree
 from pipeline.stage import LocalContext
-from stages.align.bundle import BundleOptions, refine_with_matches
+from stages.align.bundle import (
+    BundleOptions,
+    _adjust,
+    _errors,
+    _Features,
+    _model,
+    _read,
+    refine_with_matches,
+)
 from stages.align.optimise import AlignOptions, optimise
 from stages.align.stage import AlignConfig, AlignStage
 from tests.stages import dense_scene as scene
@@ -103,6 +111,32 @@ def test_no_features_outside_the_mask(world):
     covered = {name: np.zeros_like(mask) for name, mask in masks.items()}
     bundle = refine_with_matches(grays, covered, cameras, depths, BundleOptions())
     assert bundle.tracks == 0
+
+
+def test_photographs_of_other_shapes_have_a_lens_of_their_own():
+    """Six perfect cameras, every other one upright."""
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    cameras = []
+    for k in range(6):
+        size = (480, 640) if k % 2 else (640, 480)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", 8 * k - 20, degrees=True).as_matrix()
+        pose[2, 3] = 5
+        cameras.append(Camera(f"{k:03d}", *size, 700, 700, size[0] / 2, size[1] / 2, pose))
+    features = [
+        _Features(camera.project(points)[0], np.zeros((200, 128), np.float32), points)
+        for camera in cameras
+    ]
+    tracks = [[(view, point) for view in range(6)] for point in range(200)]
+    for free_focals in (False, True):
+        options = BundleOptions(shared_focal=True, free_focals=free_focals)
+        model = _model(cameras, features, tracks, options)
+        assert len(model.cameras) == 2
+        _adjust(model, options)
+        assert np.median(_errors(model)) < 1e-6
+        refined = {c.name: _read(model, k, c) for k, c in enumerate(cameras, start=1)}
+        assert turned(refined, cameras) < 1e-3
+        assert all(abs(camera.fx - 700) < 0.1 for camera in refined.values())
 
 
 def test_the_stage_uses_matches_where_cameras_come_from_pointmaps_alone(world, tmp_path):

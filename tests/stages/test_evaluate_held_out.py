@@ -18,7 +18,10 @@ from pipeline.stage import LocalContext
 from pipeline.untrusted.scenes.transforms import OPENCV_FROM_OPENGL
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.stage import EvaluateStage
+from stages.evaluate.truth import scoring_mask
 from stages.splatting import render
+from stages.views.orientation import make_stored
+from stages.views.working import prepare
 from tests.stages.evaluate_scene import arc, moved_world, rotation, textured_scene
 
 ANGLES = [-24.0, -16, -8, 0, 8, 16, 24]
@@ -104,6 +107,33 @@ def test_everything_where_the_reconstruction_is_exact(tmp_path: Path) -> None:
     assert {"heldout_comparison_h000.png", "support_h001.png", "support_novel_first.png"} <= written
     novel = figures["novel"]["views"]
     assert novel["first"]["unsupported"] >= held["registered"]["mean"]["unsupported"]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_masks_lie_as_they_do_for_the_stage_views(tmp_path: Path, orientation: int) -> None:
+    """Upright, or stored where only that has their shape; of a mirror image turned back, too."""
+    mask = np.zeros((60, 80), np.uint8)
+    mask[:20, :30] = mask[40:, 20:30] = 255
+    photo = make_stored(np.zeros((60, 80, 3), np.uint8), orientation)
+    picture = prepare(photo, None, orientation, None, 40, mask > 0)
+    assert picture.mask is not None
+    view = View(
+        "000", picture.rgb.astype(np.float32), source_name="p.jpg", source_size=picture.source_size,
+        working_from_source=picture.working_from_source,
+    )  # fmt: skip
+    path = tmp_path / "p.png"
+    shapes = [mask, mask[::2, ::2]]
+    if orientation >= 5:
+        shapes += [make_stored(shape, orientation) for shape in shapes]
+    for shape in shapes:
+        write_png(path, np.ascontiguousarray(shape))
+        found = scoring_mask({path.name: path}, view)
+        np.testing.assert_array_equal(found, picture.mask)
+        turned = scoring_mask({path.name: path}, view.mirrored())
+        np.testing.assert_array_equal(turned, picture.mask[:, ::-1])
+    write_png(path, np.zeros((60, 60), np.uint8))
+    with pytest.raises(RequestError, match=r"60 x 60 pixels, but the photograph p\.jpg"):
+        scoring_mask({path.name: path}, view)
 
 
 def test_refinement_mends_wrong_true_cameras_only_in_its_own_protocol(tmp_path: Path) -> None:

@@ -115,6 +115,26 @@ def test_the_same_bytes_and_never_larger_than_asked() -> None:
     np.testing.assert_allclose(part.vertices[part.faces], first.vertices[first.faces[:10]])
 
 
+def test_photographs_are_not_shrunk_for_faces_that_none_shows() -> None:
+    """A quarter of 20,000 faces: with a patch each they would fill the texture twice."""
+    mesh = sheet(
+        101, 101, lambda u, v: (2 * u - 1, 2 * v - 1, 0 * u), lambda u, v: (u, v, 0.5 + 0 * u)
+    )
+    one, masks = camera(0.0), {"000": np.ones((SIZE, SIZE), bool)}
+    masks["000"][:24] = False
+    mesh = replace(mesh, colors=0.8 * mesh.colors)
+    found = textured(mesh, sights(mesh, [one], masks), [picture(one, mesh)], 200)
+    assert (~found.photographed).sum() * 16 > 2 * 200**2
+    image = Image.open(io.BytesIO(found.picture))
+    assert max(image.size) <= 200
+    pixels = found.places[found.faces] * image.size
+    shown = np.ptp(pixels[found.photographed].reshape(-1, 2), axis=0)
+    assert shown.min() > 0.7 * SIZE and shown.max() > 0.98 * SIZE
+    column, row = pixels.mean(1).astype(int).T
+    error = np.abs(np.asarray(image)[row, column] - 255 * mesh.colors[mesh.faces].mean(1))
+    assert np.median(error[~found.photographed]) < 6
+
+
 def test_seams_are_evened_out() -> None:
     mesh = flat()
     label = (mesh.vertices[mesh.faces].mean(1)[:, 0] > 0).astype(np.int64)

@@ -11,11 +11,13 @@ import pytest
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.corrections import CORRECTIONS
 from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
 from stages.init.dental.choice import ByTeeth
 from stages.init.dental.place import only_two
+from stages.init.dental.read import labelled_teeth, turned_as_said
 from stages.init.placement import Placement
 from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.sounding import Sounding, sound
@@ -247,3 +249,17 @@ def test_features_see_what_is_said_to_be_mirrored_turned_over(tmp_path, monkeypa
     for number, (view, given) in enumerate(zip(seen, photographs(3).views, strict=True)):
         expected = given.mirrored() if number == 1 else given
         np.testing.assert_array_equal(view.image, expected.image)
+
+
+def test_corrections_are_places_of_the_photograph_as_it_was_taken(tmp_path):
+    said = "photographs: {p1.jpg: {mirrored: true, crowns: [{at: [35, 30], tooth: 22}]}}"
+    sources = {CORRECTIONS: write(tmp_path / "teeth.yaml", said)}
+    views = tuple(replace(v, source_size=(v.width, v.height)) for v in photographs(3).views)
+    given = Views(views)
+    inputs = {"views": given, "teeth": read_teeth()}
+    context = LocalContext(InitConfig(), tmp_path / "w", inputs, sources, threads=1)
+    turned = turned_as_said(context, given)
+    assert [view.turned_over for view in turned.views] == [False, True, False]
+    for views in (given, turned):
+        crowns = labelled_teeth(context, views).views[1].all_crowns
+        assert [crown.number for crown in crowns if crown.doubt == 0] == [22]

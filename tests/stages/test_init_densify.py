@@ -1,6 +1,5 @@
 """When depth is completed by the shape of teeth, and what of it is used."""
 
-
 import numpy as np
 import pytest
 

@@ -133,6 +133,20 @@ def test_times_are_told_from_the_first_photograph_on(tmp_path: Path) -> None:
     assert b"2019" not in b"".join(artifact_bytes(tmp_path / "out" / "views").values())
 
 
+def test_times_of_held_out_photographs_begin_with_those_of_the_views(tmp_path: Path) -> None:
+    for n, time in enumerate(("08:15:00", "08:16:30", "08:15:40", "08:17:00")):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = f"2019:07:04 {time}"
+        write(tmp_path / "in" / f"{n}.jpg", picture(n), exif=exif if n != 1 else Image.Exif())
+        write(tmp_path / "none" / f"{n}.jpg", picture(n), exif=exif if n < 1 else Image.Exif())
+    views, context, _ = run_stage(tmp_path / "a", [tmp_path / "in"], held_out=["0", "3"])
+    assert [view.taken_after for view in views.views] == [None, 0]
+    assert [view.taken_after for view in context.result("held_out").views] == [-40, 80]
+    views, context, _ = run_stage(tmp_path / "b", [tmp_path / "none"], held_out=["0"])
+    assert {view.taken_after for view in views.views} == {None}
+    assert [view.taken_after for view in context.result("held_out").views] == [0]
+
+
 def test_duplicates_are_left_out_with_a_warning(tmp_path: Path) -> None:
     write(tmp_path / "in" / "a.png", picture(1))
     write(tmp_path / "in" / "b.bmp", picture(1))

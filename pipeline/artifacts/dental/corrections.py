@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pipeline.artifacts.dental.fdi import ALL_TEETH
+from pipeline.artifacts.dental.fdi import ALL_TEETH, THE_NUMBERS
 from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.paths import user_path
 from pipeline.untrusted.plain_yaml import read_plain_yaml
@@ -177,10 +177,7 @@ def _crown(entry: object, where: str) -> CrownCorrection:
         return CrownCorrection(at, split=(start, end))
     tooth = given["tooth"]
     if isinstance(tooth, bool) or not isinstance(tooth, int) or tooth not in ALL_TEETH:
-        raise RequestError(
-            f"{where}.tooth: {_shown(tooth)} is no tooth's number. FDI numbers are 11-18, 21-28, "
-            "31-38 and 41-48; of primary teeth 51-55, 61-65, 71-75 and 81-85."
-        )
+        raise RequestError(f"{where}.tooth: {_shown(tooth)} is no tooth's number. {THE_NUMBERS}.")
     return CrownCorrection(at, tooth=tooth)
 
 

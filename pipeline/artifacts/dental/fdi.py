@@ -16,6 +16,10 @@ ALL_TEETH = frozenset(
     [10 * q + p for q in range(1, 5) for p in range(1, 9)]
     + [10 * q + p for q in range(5, 9) for p in range(1, 6)]
 )
+#: Which those are, as the end of a message.
+THE_NUMBERS = (
+    "FDI numbers are 11-18, 21-28, 31-38 and 41-48; of primary teeth 51-55, 61-65, 71-75 and 81-85"
+)
 #: Primary teeth have so many places from the midline.
 PRIMARY_PLACES = 5
 _PRIMARY_LETTERS = "ABCDEFGHIJKLMNOPQRST"

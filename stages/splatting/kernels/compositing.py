@@ -4,8 +4,8 @@ A tile is 32x32 pixels, in 64 blocks of 4x4: a block is one vector of 16 lanes (
 what a Gaussian touches of a tile is one number of 64 bits. The first three features of a Gaussian
 are its colour; any further ones (depth, flow, ...) run in a loop of their own over the same
 weights, so that one compiled kernel serves every number of channels. No atomics on results: each
-pair (tile, Gaussian) has its own slot of sums, and `gather.gather` adds the slots of a Gaussian in
-a fixed order. Threads take the next tile as they are free: which thread does one changes nothing.
+pair (tile, Gaussian) has its own slot of sums, and `gathering.gather` adds the slots of a Gaussian
+in a fixed order. Threads take the next tile as they are free: which does one changes nothing.
 
 With t = dx + (b / a) dy the ellipse a dx^2 + 2 b dx dy + c dy^2 is a t^2 + e dy^2, where 1 / e is
 the variance along y: no mixed term, and no cancellation between large terms far from the centre of

@@ -25,6 +25,9 @@ Bools = npt.NDArray[np.bool_]
 MARGIN = 4
 #: Pixels square of a face that no photograph shows, with its corners in the middle of three.
 PATCH = 4
+#: Where they would take more than this share of the largest texture, and the photographs not have
+#: room beside them, faces of a colour share one: of ever fewer colours, this far apart.
+PATCHES, COLORS_APART = 0.25, (4, 8, 16, 32, 64, 128, 256)
 #: Colours at vertices are means over so many pixels square.
 SAMPLE = 5
 #: Smaller by this factor until all pieces have room.
@@ -194,24 +197,55 @@ def _piece(group: Ints, k: int, faces: Numbers, sight: Sight, picture: Pixels) -
     return _Piece(np.sort(group), k, int(left), int(top), int(right), int(bottom))
 
 
-def _laid_out(
-    mesh: Mesh, pieces: Sequence[_Piece], even: Sequence[Pixels], seen: Sequence[Sight],
-    unseen: Ints, own: Array, largest: int,
-) -> TexturedMesh:  # fmt: skip
-    """Put all pieces into one picture, and say where each face is in it."""
-    scale, across = 1.0, 0
+@dataclass(frozen=True)
+class _Block:
+    """Faces that no photograph shows, as one piece of the texture.
+
+    Attributes:
+        picture: rows of patches.
+        places: [N, 3, 2] of the corners of the faces in it, pixels.
+    """
+
+    picture: Pixels
+    places: Array
+
+    @property
+    def size(self) -> tuple[int, int]:
+        height, width = self.picture.shape[:2]
+        return width, height
+
+
+def _arranged(
+    pieces: Sequence[_Piece], blocks: Sequence[_Block], largest: int
+) -> tuple[list[tuple[int, int]], _Block, list[tuple[int, int]], tuple[int, int]]:
+    """Room for all pieces and a block: the first that does without shrinking the pieces more.
+
+    Returns:
+        Sizes of the pieces, the block, the upper left corners of these and of that, and width and
+        height of all together.
+    """
+    scale = 1.0
     while True:
         sizes = [
             (max(1, round((p.right - p.left) * scale)), max(1, round((p.bottom - p.top) * scale)))
             for p in pieces
         ]
-        # the faces without a photograph: a block of rows of patches
-        across = max(1, min(largest // PATCH, int(np.ceil(np.sqrt(len(unseen))))))
-        block = (PATCH * across, PATCH * -(-len(unseen) // across))
-        corners, width, height = packed([*sizes, block], largest)
-        if max(width, height) <= largest or scale < 1e-2:
-            break
+        for block in blocks:
+            corners, width, height = packed([*sizes, block.size], largest)
+            if max(width, height) <= largest:
+                return sizes, block, corners, (width, height)
+        if scale < 1e-2:
+            return sizes, blocks[-1], corners, (width, height)
         scale *= SHRINK
+
+
+def _laid_out(
+    mesh: Mesh, pieces: Sequence[_Piece], even: Sequence[Pixels], seen: Sequence[Sight],
+    unseen: Ints, own: Array, largest: int,
+) -> TexturedMesh:  # fmt: skip
+    """Put all pieces into one picture, and say where each face is in it."""
+    blocks = _blocks(own[mesh.faces[unseen]], largest)
+    sizes, block, corners, (width, height) = _arranged(pieces, blocks, largest)
     picture = np.full((height, width, 3), 128, np.uint8)
     places = np.zeros((len(mesh.faces), 3, 2))
     number = np.full(len(mesh.faces), len(pieces), np.int64)
@@ -226,11 +260,9 @@ def _laid_out(
         share = np.array(size) / (piece.right - piece.left, piece.bottom - piece.top)
         places[piece.faces] = local * share + corner
         number[piece.faces] = index
-    if len(unseen):
-        patches, local = _patches(own[mesh.faces[unseen]], across)
-        x, y = corners[-1]
-        picture[y : y + block[1], x : x + block[0]] = patches
-        places[unseen] = local + np.array([x, y])
+    x, y = corners[-1]
+    picture[y : y + block.size[1], x : x + block.size[0]] = block.picture
+    places[unseen] = block.places + np.array([x, y])
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]  # fmt: skip
     _, jpeg = cv2.imencode(".jpg", picture[..., ::-1], quality)
@@ -247,16 +279,40 @@ def _laid_out(
     )  # fmt: skip
 
 
-def _patches(colors: Array, across: int) -> tuple[Pixels, Array]:
-    """A square of `PATCH` pixels for each of N faces, in rows of `across`.
+def _blocks(colors: Array, largest: int) -> list[_Block]:
+    """Faces that no photograph shows, with one patch each; where those are many, with ever fewer.
+
+    Args:
+        colors: [N, 3, 3] of their corners, 0..255.
+        largest: width and height of the texture, at most.
+    """
+    block = _patches(colors, largest)
+    if block.size[0] * block.size[1] <= PATCHES * largest**2:
+        return [block]
+    return [block, *(_shared(colors, apart, largest) for apart in COLORS_APART)]
+
+
+def _shared(colors: Array, apart: int, largest: int) -> _Block:
+    """One patch of one colour for all faces whose colours are in the same cell, so wide, of RGB."""
+    even = colors.mean(1)
+    red, green, blue = (even // apart).astype(np.int64).T
+    _, cell, count = np.unique(
+        (red << 16) + (green << 8) + blue, return_inverse=True, return_counts=True
+    )
+    mean = np.stack([np.bincount(cell, channel) for channel in even.T], 1) / count[:, None]
+    block = _patches(np.repeat(mean[:, None], 3, 1), largest)
+    return replace(block, places=block.places[cell])
+
+
+def _patches(colors: Array, largest: int) -> _Block:
+    """A square of `PATCH` pixels for each of N faces, in rows.
 
     Args:
         colors: [N, 3, 3] of the corners, 0..255.
-
-    Returns:
-        The picture, and where in it the corners are [N, 3, 2].
+        largest: width of the rows, at most.
     """
     count = len(colors)
+    across = max(1, min(largest // PATCH, int(np.ceil(np.sqrt(count)))))
     steps = (np.arange(PATCH) - 0.5) / (PATCH - 2)
     right, down = np.meshgrid(np.clip(steps, 0, 1), np.clip(steps, 0, 1))
     a, b, c = (colors[:, k, None, None] for k in range(3))
@@ -267,7 +323,7 @@ def _patches(colors: Array, across: int) -> tuple[Pixels, Array]:
     picture = squares.reshape(rows, across, PATCH, PATCH, 3).swapaxes(1, 2)
     corner = np.stack(np.divmod(np.arange(count), across)[::-1], 1) * PATCH
     offsets = np.array([[1.0, 1.0], [PATCH - 1.0, 1.0], [1.0, PATCH - 1.0]])
-    return picture.reshape(rows * PATCH, across * PATCH, 3), corner[:, None] + offsets
+    return _Block(picture.reshape(rows * PATCH, across * PATCH, 3), corner[:, None] + offsets)
 
 
 def packed(
