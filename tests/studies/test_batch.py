@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -42,8 +43,8 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..
 
     def call(cases: str = "cases", **options: Any) -> dict[str, Any]:
         (tmp_path / "log.txt").write_text("")
-        given = {"preset": tmp_path / "toy.yaml", "jobs": 2, **options}
-        found = batch(tmp_path / cases, out=tmp_path / "out", **given)
+        given = {"preset": tmp_path / "toy.yaml", "jobs": 2, "out": tmp_path / "out", **options}
+        found = batch(tmp_path / cases, **given)
         return {record["name"]: record for record in found["cases"]}
 
     yield call
@@ -146,6 +147,115 @@ def test_a_case_may_take_so_much_time_and_is_tried_again_when_asked(
     (tmp_path / "cases.csv").write_text(text)
     assert run("cases.csv") == found and computed(tmp_path) == {}
     assert run("cases.csv", retry=["failed"])["slow"]["state"] == "done"
+
+
+def test_a_file_that_a_setting_names_is_read_again_when_it_is_another(
+    run: Any, tmp_path: Path
+) -> None:
+    one, two = tmp_path / "one.txt", tmp_path / "two.txt"
+    one.write_text("1")
+    two.write_text("2")
+    listed(tmp_path, a="", like="", other=f"fit.file={one}", other_like=f"fit.file={two}")
+    text = (tmp_path / "cases.csv").read_text()
+    for name in ("like", "other", "other_like"):
+        text = text.replace(f"cases/{name},", "cases/a,")
+    (tmp_path / "cases.csv").write_text(text)
+    states = {name: record["state"] for name, record in run("cases.csv").items()}
+    assert states == {"a": "done", "like": "duplicate", "other": "done", "other_like": "done"}
+    before = run("cases.csv")
+    assert computed(tmp_path) == {}
+    two.write_text("1")
+    assert run("cases.csv")["other_like"]["state"] == "duplicate"
+    one.write_text("3")
+    assert run("cases.csv")["other"]["files"] != before["other"]["files"]
+    assert computed(tmp_path) == {"fit": 2}
+    one.rename(tmp_path / "moved.txt")
+    (tmp_path / "cases.csv").write_text(text.replace("one.txt", "moved.txt"))
+    run("cases.csv")
+    assert computed(tmp_path) == {}, "what it says is the same"
+    found = run("cases.csv", overrides=[f"fit.file={two}"])
+    assert found["a"]["state"] == "done" and computed(tmp_path)["fit"] == 1
+    found = run("cases.csv", overrides=[f"fit.file={tmp_path / 'nowhere.txt'}"])
+    assert found["a"]["state"] == "wrong" and found["other"]["state"] == "done"
+
+
+def test_what_a_person_put_right_is_taken_by_the_same_command(run: Any, tmp_path: Path) -> None:
+    add_case(tmp_path, "a", 1, 2)
+    add_case(tmp_path, "b", 1, 2)
+    add_case(tmp_path, "c", 3, 4)
+    first = run()
+    said = tmp_path / "out" / "cases" / "a" / "teeth.yaml"
+    for text in ("photographs: {}\n", "photographs:\n  1.jpg: {mirrored: true}\n"):
+        said.write_text(text)
+        found = run()
+        assert computed(tmp_path)["fit"] == 1 and computed(tmp_path)["views"] == 0
+        assert found["b"]["state"] == "duplicate" and found["c"] == first["c"]
+        assert run() == found and computed(tmp_path) == {}
+    said.unlink()
+    assert run()["a"]["key"] == first["a"]["key"] != found["a"]["key"]
+    assert computed(tmp_path) == {}, "the store had it"
+
+
+def test_a_case_that_is_refused_now_shows_no_earlier_scene(run: Any, tmp_path: Path) -> None:
+    case = add_case(tmp_path, "a", 1, 2)
+    picture = tmp_path / "out" / "thumbnails" / "a.jpg"
+    assert {"viewer", "results"} <= set(run()["a"]["links"]) and picture.is_file()
+    (tmp_path / "out" / "cases" / "a" / "report.html").write_text("of this run or an earlier one")
+    (case / "1.jpg").write_text("7")
+    assert run(overrides=["fit.fail=refused"])["a"]["links"] == {"report": "report.html"}
+    assert not picture.exists()
+    assert "results" not in (tmp_path / "out" / "summary.csv").read_text()
+    assert "viewer" in run()["a"]["links"] and picture.is_file()
+    assert run(overrides=["fit.file=nowhere"])["a"]["links"] == {}, "no page is written then"
+    assert run(overrides=["fit.fail=killed"])["a"]["links"] == {} and not picture.exists()
+
+
+def test_a_process_that_dies_before_it_says_anything_is_given_up(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipeline.studies.batch import task
+
+    case, command = add_case(tmp_path, "a", 1, 2), task.COMMAND
+
+    def dying(how: str) -> tuple[str, int, dict[str, str]]:
+        monkeypatch.setattr(task, "COMMAND", (sys.executable, "-c", f"import os; {how}"))
+        found = run(retry=["failed"])["a"]
+        return found["state"], found["attempts"], found["links"]
+
+    assert dying("os.kill(os.getpid(), 4)") == ("killed", 3, {})
+    monkeypatch.setattr(task, "COMMAND", command)
+    assert run(retry=["failed"])["a"]["state"] == "done"
+    (case / "1.jpg").write_text("7")
+    assert dying("x") == ("fault", 1, {})
+    assert dying("os.kill(os.getpid(), 9)") == ("killed", 3, {})
+
+
+def test_without_a_limit_it_takes_the_memory_it_needs(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipeline.studies.batch import task
+
+    monkeypatch.setattr(task, "_memory", lambda: 1)  # what the worker was given
+    listed(tmp_path, a="fit.wait=1")
+    assert run("cases.csv", memory=0)["a"]["state"] == "done"
+
+
+def test_each_folder_of_cases_has_a_folder_of_results(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for number, place in enumerate(("29.11.2025", "29.11.2026", "north/2024", "south/2024")):
+        add_case(tmp_path, f"{place}/a", 10 * number, 10 * number + 1)
+    for place in ("29.11.2025", "29.11.2026", "north/2024"):
+        run(f"cases/{place}", out=None)
+    made = {path.name for path in (tmp_path / "runs").iterdir()}
+    assert made == {"batch_29.11.2025", "batch_29.11.2026", "batch_2024"}
+    with pytest.raises(RequestError, match=r"other cases, those of .*north/2024.*-o"):
+        run("cases/south/2024", out=None)
+    assert run("cases/north/2024", out=None)["a"]["state"] == "done" and computed(tmp_path) == {}
+    (tmp_path / "cases" / "north").rename(tmp_path / "cases" / "moved")
+    assert run("cases/moved/2024", out=None)["a"]["state"] == "done"
+    assert computed(tmp_path) == {}, "it was known by what the photographs hold"
 
 
 def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+from pipeline import run
 from pipeline.errors import RequestError
+from pipeline.files import sha256_file, write_json
 from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
-from pipeline.studies.batch.keep import keep_results
+from pipeline.studies.batch.keep import keep_results, write_thumbnail
 from pipeline.studies.batch.listing import read_cases
-from pipeline.studies.batch.records import Case, new_record
+from pipeline.studies.batch.plan import check_folder, make_plan
+from pipeline.studies.batch.records import Case, new_record, write_case
+from pipeline.studies.batch.sources import contents_of, settings_of
 from pipeline.studies.batch.summary import MEASURED, csv_text, write_summary
 from stages.export.measuring.measures import RULES
 
+DATA = Path(__file__).resolve().parents[2] / "data_samples"
 HOSTILE = (
     "../../etc", "a/b", "a__b", "A__B", "con", "<script>alert(1)</script>", "ü", ".",
     "x" * 300, "a b", "a_b", "%2e%2e", "'\"&#", "\N{TOOTH}", "-rf", "NUL.txt", "",
@@ -132,6 +140,101 @@ def test_a_wrong_list_is_refused(tmp_path: Path, text: str, what: str) -> None:
     (tmp_path / "list.csv").write_bytes(b"name,photographs\n\xff\xfe,b\n")
     with pytest.raises(RequestError, match="not text in UTF-8"):
         read_cases(tmp_path / "list.csv", Names({}))
+
+
+def test_files_that_settings_name_are_files_of_a_case(tmp_path: Path) -> None:
+    """By what each stage that is run reads, also of stages that run unnamed."""
+    pictures(tmp_path / "cases" / "a")
+    pictures(tmp_path / "masks")
+    (tmp_path / "transforms.json").write_text("{}")
+    (tmp_path / "splats.ply").write_text("ply")
+    given = (
+        f"views.masks={tmp_path / 'masks'}", f"init.cameras={tmp_path}",
+        f"swap.cameras={tmp_path}", f"splats.file={tmp_path / 'splats.ply'}",
+        f"evaluate.ground_truth={tmp_path}", f"evaluate.masks={tmp_path / 'masks'}",
+    )  # fmt: skip
+    stages = ("init", "swap", "splats", "evaluate")
+
+    def made(*overrides: str) -> Case:
+        plan = make_plan(tmp_path / "cases", tmp_path / "out", None, overrides, stages, ())
+        assert [case.id for case in plan.waiting] == ["a"]
+        return plan.cases[0]
+
+    case = made(*given)
+    assert {label for label, _, _, _ in case.named} == {
+        "views: masks/0.jpg", "views: masks/1.jpg", "init: cameras/transforms.json",
+        "swap: cameras/transforms.json", "splats: splats.ply", "evaluate: masks/0.jpg",
+        "evaluate: masks/1.jpg", "evaluate: ground_truth/transforms.json",
+    }  # fmt: skip
+    assert len(case.stamps) == len(case.files) + len(case.named)
+    assert Case.from_dict(json.loads(json.dumps(case.to_dict()))) == case
+    before = contents_of(case.named)
+    (tmp_path / "splats.ply").write_text("PLY")
+    (changed,) = {*contents_of(made(*given).named)} - {*before}
+    assert changed.startswith("splats: splats.ply ")
+    wrong = made(*given[:3], f"splats.file={tmp_path / 'none.ply'}")
+    assert any("there is no file" in label for label, _, _, _ in wrong.named)
+    small = settings_of(None, ("views.long_side=256",), stages)
+    assert small.key != settings_of(None, (), stages).key
+
+
+def test_a_folder_of_another_batch_is_not_taken(tmp_path: Path) -> None:
+    north, south, out = tmp_path / "north", tmp_path / "south", tmp_path / "out"
+    (out / "records").mkdir(parents=True)
+    pictures(north / "anna", 2)
+    pictures(south / "anna", 3)
+    (south / "anna" / "0.jpg").write_bytes(b"ab")
+    for k in (1, 2):
+        (south / "anna" / f"{k}.jpg").write_bytes(b"abc")
+    pictures(south / "berta", 2)
+    cases = {place: find_cases(place, Names({})) for place in (north, south)}
+    check_folder(out, north, cases[north], chosen=False)
+    write_json(out / "batch.json", {"cases": str(north)})
+    for case in cases[north]:
+        write_case(out, new_record(case, "done"))
+    for chosen in (True, False):
+        check_folder(out, north, cases[north], chosen=chosen)
+        with pytest.raises(RequestError, match=r"of other cases, those of .*north"):
+            check_folder(out, south, cases[south], chosen=chosen)
+    check_folder(out, south, cases[south][1:], chosen=True)  # others join them
+    copy = tmp_path / "copy"
+    shutil.copytree(north, copy)
+    check_folder(out, copy, find_cases(copy, Names({})), chosen=True)
+    north.rename(tmp_path / "moved")
+    check_folder(out, south, cases[south], chosen=False)
+    (out / "batch.json").write_text("[")
+    check_folder(out, copy, cases[south], chosen=False)
+
+
+def test_a_picture_is_of_the_photographs_that_were_read(tmp_path: Path) -> None:
+    frames = sorted((DATA / "twelve_frames").glob("*.jpg"))[:2]
+    workspace, picture = tmp_path / "w", tmp_path / "a.jpg"
+    run(
+        frames, workspace=workspace, stages=["views"],
+        overrides={"views.long_side": 128, "report": False},
+    )  # fmt: skip
+    contents = [sha256_file(frame) for frame in frames]
+    write_thumbnail(workspace, picture, contents[:1], scene=False)
+    assert not picture.exists()
+    write_thumbnail(workspace, picture, contents, scene=False)
+    photograph = picture.read_bytes()
+    (workspace / "results").mkdir()
+    Image.new("RGB", (8, 6), "red").save(workspace / "results" / "preview.png")
+    write_thumbnail(workspace, picture, contents, scene=False)
+    assert picture.read_bytes() == photograph
+    write_thumbnail(workspace, picture, contents, scene=True)
+    assert picture.read_bytes() != photograph
+
+
+def test_the_summary_sorts_by_how_many_are_placed(tmp_path: Path) -> None:
+    records = [
+        new_record(Case(str(placed), "x"), "done", placed=placed, photographs=14)
+        for placed in (9, 12, None)
+    ]
+    write_summary(tmp_path, records, "Batch", "")
+    page = (tmp_path / "summary.html").read_text()
+    for cell in ('data-v="9">9 of 14<', 'data-v="12">12 of 14<', 'data-v="-1">–<'):
+        assert cell in page
 
 
 def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 
+from PIL import Image
 from toy import Numbers, ToyEntryPoint
 
 import pipeline.stage
@@ -62,6 +63,12 @@ class FitStage(Stage):
         fail: str = ""
         wait: float = runtime(0.0)
         megabytes: int = 0
+        file: str = runtime("")
+
+    def sources(self, config: Any, request: Any) -> dict[str, Path]:
+        found = {"file": Path(config.file)} if config.file else {}
+        said = Path(request["workspace"]) / "teeth.yaml"
+        return found | ({"teeth.yaml": said} if said.exists() else {})
 
     def run(self, context: StageContext) -> None:
         log(self, context)
@@ -99,6 +106,7 @@ class ExportStage(Stage):
         found = {"teeth": [11, 12, 13], "measurements": [overjet, hidden]}
         (folder / "teeth.json").write_text(json.dumps(found))
         (folder / "viewer.html").write_text("<p>a scene")
+        Image.new("RGB", (8, 6), "red").save(folder / "preview.png")
         (folder / "splats.ply").write_bytes(bytes(9_000_000))
         (folder / "mesh.ply").write_bytes(bytes(1000))
         (folder / "colmap").mkdir()

@@ -14,11 +14,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PipelineError, ReconstructionError, RequestError
+from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
 from pipeline.files import canonical_json, sha256_file, sha256_text
 from pipeline.front.commands import run
 from pipeline.front.progress import LineReporter
@@ -28,9 +28,17 @@ from pipeline.running.outcomes import RunSummary
 from pipeline.running.reporter import Reporter
 from pipeline.store import is_disk_full
 from pipeline.store.locks import lock_of
-from pipeline.store.places import is_there, size_of
-from pipeline.studies.batch.keep import clear_kept, keep_results, write_thumbnail
-from pipeline.studies.batch.records import FINAL, Case, new_record, read_case, write_case
+from pipeline.store.places import is_there, remove, size_of
+from pipeline.studies.batch.keep import clear_kept, keep_results, thumbnail_of, write_thumbnail
+from pipeline.studies.batch.records import (
+    FINAL,
+    Case,
+    new_record,
+    read_case,
+    workspace_of,
+    write_case,
+)
+from pipeline.studies.batch.sources import contents_of, settings_of, with_others
 from pipeline.untrusted.names import readable
 
 #: What the summary links to, where it is there: name -> place in a case's folder.
@@ -38,6 +46,8 @@ LINKS = {
     "viewer": "results/viewer.html", "report": "report.html", "check": "check.html",
     "results": "results",
 }  # fmt: skip
+#: Those that say what came of a run that failed.
+PAGES = ("report", "check")
 #: Exit status of a process that could not write because the disk is full.
 DISK_FULL = 74
 
@@ -64,22 +74,25 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
     Another process that works on the same case is waited for; what it finds is taken.
     """
     case, out = Case.from_dict(job["case"]), Path(job["out"])
-    workspace = out / "cases" / case.id
+    workspace = workspace_of(out, case)
     workspace.mkdir(parents=True, exist_ok=True)
     with lock_of(workspace):
         before = read_case(out, case.id)
         record = new_record(case, "running", settings=job["settings"], session=job["session"])
-        record["contents"], trouble = _contents(case)
+        record["contents"], trouble = _contents(job, case, workspace)
         if before is not None and not (job["again"] and before["session"] != job["session"]):
             same = all(before[k] == record[k] for k in ("settings", "contents"))
             if before["state"] in FINAL and same and trouble is None:
-                record = {**before, "files": case.stamps, "name": case.name}
+                told = {"files": case.stamps, "name": case.name, "session": job["session"]}
+                record = {**before, **told}
                 record = _trimmed(record, job, workspace)
                 write_case(out, record)
                 return record
         attempts = before["attempts"] if before and before["session"] == job["session"] else 0
         record |= {"attempts": attempts + 1, "host": socket.gethostname()}
         write_case(out, record)
+        thumbnail = thumbnail_of(out, case.id)
+        remove(thumbnail)
         start = time.perf_counter()
         if trouble is None:
             record |= _outcome(job, case, workspace, reporter or _reporter(job))
@@ -91,10 +104,8 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
         record["seconds"] = round(time.perf_counter() - start, 2)
         record["peak_memory_mb"] = round(peak_mb_with_children(), 1)
         with contextlib.suppress(OSError):
-            write_thumbnail(workspace, out / "thumbnails" / f"{case.id}.jpg")
-        record["links"] = {
-            name: place for name, place in LINKS.items() if (workspace / place).exists()
-        }
+            scene = record["state"] == "done"
+            write_thumbnail(workspace, thumbnail, record["contents"], scene=scene)
         record["bytes"] = size_of(workspace)
         # First the record that it is done, then what is not needed: a kill between loses nothing.
         write_case(out, record)
@@ -109,15 +120,27 @@ def _reporter(job: dict[str, Any]) -> Reporter:
     return LineReporter(interval=5.0 if job["verbose"] else 20.0, verbose=job["verbose"])
 
 
-def _contents(case: Case) -> tuple[list[str], str | None]:
-    """Hash of each photograph; and why one can't be read."""
+def _contents(job: dict[str, Any], case: Case, workspace: Path) -> tuple[list[str], str | None]:
+    """Hash of each photograph and of each other file that is read here; and why a photograph
+    can't be read."""
     found = []
     for path, _, _ in case.files:
         try:
             found.append(sha256_file(Path(path)))
         except OSError as error:
             return [], f"{path} can't be read ({error.strerror or error})."
-    return sorted(found), None
+    stages = tuple(job["stages"]) if job["stages"] else None
+    try:
+        settings = settings_of(job["preset"], (*job["overrides"], *case.overrides), stages)
+    except PipelineError as error:  # the run says so
+        return [*sorted(found), str(error)], None
+    here = with_others(case, settings, workspace)
+    return [*sorted(found), *contents_of((*here.named, *here.put))], None
+
+
+def _links(workspace: Path, names: Iterable[str]) -> dict[str, str]:
+    """Those of these names that lead somewhere."""
+    return {name: LINKS[name] for name in names if (workspace / LINKS[name]).exists()}
 
 
 def _outcome(
@@ -136,8 +159,11 @@ def _outcome(
             error.__cause__ is not None and is_disk_full(error.__cause__, workspace)
         ):
             return {"state": "stopped", "reason": str(error)}
-        return {"state": _state_of(error), "reason": _reason_of(error)}
-    return {"state": "done", **_figures(summary)}
+        # of other faults no page was written: one that is there shows an earlier run
+        pages = PAGES if isinstance(error, ReconstructionError | StageError) else ()
+        links = _links(workspace, pages)
+        return {"state": _state_of(error), "reason": _reason_of(error), "links": links}
+    return {"state": "done", "links": _links(workspace, LINKS), **_figures(summary)}
 
 
 def _state_of(error: Exception) -> str:
@@ -198,9 +224,8 @@ def _trimmed(record: dict[str, Any], job: dict[str, Any], workspace: Path) -> di
     if not is_there(workspace / "results") and not is_there(workspace / ".results"):
         return {**record, "left_out": [], "kept": "all"}  # it exports nothing: all is results
     left_out = keep_results(workspace)
-    links = {name: place for name, place in LINKS.items() if (workspace / place).exists()}
     return {
-        **record, "kept": "results", "left_out": left_out, "links": links,
+        **record, "kept": "results", "left_out": left_out, "links": _links(workspace, LINKS),
         "bytes": size_of(workspace),
     }  # fmt: skip
 

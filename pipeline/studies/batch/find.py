@@ -14,6 +14,7 @@ from pathlib import Path
 from pipeline.errors import RequestError
 from pipeline.files import sha256_file
 from pipeline.studies.batch.records import Case
+from pipeline.studies.batch.sources import contents_of
 from pipeline.untrusted.files import sort_of
 from pipeline.untrusted.names import printable
 from pipeline.workspace import GENERIC_FOLDERS
@@ -110,7 +111,7 @@ def as_case(called: str, images: Sequence[str | Path], overrides: tuple[str, ...
 def mark_duplicates(cases: Sequence[Case], settings: Mapping[str, str]) -> list[Case]:
     """Say of each case whose photographs and settings are those of an earlier one that it is so.
 
-    Only files of the same sizes are read.
+    Only files of the same sizes are read. A case with corrections of its own is like no other.
 
     Args:
         settings: id -> hash of what the case is run with.
@@ -119,7 +120,8 @@ def mark_duplicates(cases: Sequence[Case], settings: Mapping[str, str]) -> list[
     for case in cases:
         if not case.settled:
             sizes = tuple(sorted(size for _, size, _ in case.files))
-            alike.setdefault((settings[case.id], sizes), []).append(case)
+            others = tuple((label, size) for label, _, size, _ in case.named)
+            alike.setdefault((settings[case.id], sizes, others), []).append(case)
     first: dict[str, Case] = {}
     for group in alike.values():
         known: dict[tuple[str, ...], Case] = {}
@@ -128,10 +130,11 @@ def mark_duplicates(cases: Sequence[Case], settings: Mapping[str, str]) -> list[
                 contents = tuple(sorted(sha256_file(Path(path)) for path, _, _ in case.files))
             except OSError:  # its own run says so
                 continue
-            if contents in known:
-                first[case.id] = known[contents]
-            else:
+            contents += tuple(contents_of(case.named))
+            if contents not in known:
                 known[contents] = case
+            elif not case.put:
+                first[case.id] = known[contents]
     return [
         replace(
             case, settled="duplicate", like=first[case.id].id,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
 from pipeline.files import fsync_tree, temporary_beside
 from pipeline.pages.page import CHECK, REPORT
 from pipeline.stage import stage_names
+from pipeline.store import Store
 from pipeline.store.places import is_folder, is_there, remove, size_of
 from pipeline.workspace import REQUEST
 
@@ -101,9 +103,21 @@ def _copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def write_thumbnail(workspace: Path, path: Path) -> None:
-    """Write a small JPEG of what came out, or of the first photograph; nothing where neither is."""
-    candidates = [workspace / "results" / "preview.png", *_photographs(workspace)]
+def thumbnail_of(out: Path, case: str) -> Path:
+    """The picture of a case that the summary of a batch shows."""
+    return out / "thumbnails" / f"{case}.jpg"
+
+
+def write_thumbnail(workspace: Path, path: Path, contents: Collection[str], *, scene: bool) -> None:
+    """Write a small JPEG of what came out, or of the first photograph; nothing where neither is.
+
+    Args:
+        contents: what was read, as the record of the case has it: of other photographs, which the
+            workspace may hold from before, no picture is taken.
+        scene: whether the results are what came out.
+    """
+    candidates = [workspace / "results" / "preview.png"] if scene else []
+    candidates += _photographs(workspace, contents)
     candidates = [candidate for candidate in candidates if candidate.is_file()]
     if not candidates:
         return
@@ -123,5 +137,12 @@ def write_thumbnail(workspace: Path, path: Path) -> None:
                 return
 
 
-def _photographs(workspace: Path) -> list[Path]:
-    return sorted(workspace.glob("views/*/views/images/*.png"))[:1]
+def _photographs(workspace: Path, contents: Collection[str]) -> list[Path]:
+    """The first prepared photograph, if what is in use was prepared from these."""
+    found = Store(workspace).current("views")
+    if found is None:
+        return []
+    read = found.manifest["key_material"]["sources"]
+    if not all({hashed, f"views: {label} {hashed}"} & {*contents} for label, hashed in read):
+        return []
+    return sorted((found.folder / "views" / "images").glob("*.png"))[:1]

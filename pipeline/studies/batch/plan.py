@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RequestError, nearest
+from pipeline.files import read_json
 from pipeline.studies.batch.find import Names, find_cases, mark_duplicates
 from pipeline.studies.batch.listing import read_cases
 from pipeline.studies.batch.records import (
+    BATCH,
     FAILED,
     FINAL,
     Case,
     is_finished,
     new_record,
     read_case,
-    settings_key,
+    workspace_of,
 )
+from pipeline.studies.batch.sources import settings_of, with_others
 
 
 @dataclass(frozen=True)
@@ -61,8 +65,8 @@ def make_plan(
     Raises:
         RequestError: a setting, the place, or a name to retry is wrong, or there is no case.
     """
-    key_of = lru_cache(maxsize=None)(settings_key)
-    key_of(preset, overrides, stages)  # a wrong setting is refused before anything else
+    settings_for = lru_cache(maxsize=None)(settings_of)
+    settings_for(preset, overrides, stages)  # a wrong setting is refused before anything else
     out_inside = out.resolve().is_relative_to(place.resolve())
     if out_inside and place.is_dir():
         raise RequestError(
@@ -74,10 +78,14 @@ def make_plan(
     settings: dict[str, str] = {}
     for number, case in enumerate(cases):
         try:
-            settings[case.id] = key_of(preset, overrides + case.overrides, stages)
+            found = settings_for(preset, overrides + case.overrides, stages)
         except RequestError as error:
             cases[number] = replace(case, settled="wrong", reason=str(error))
             settings[case.id] = ""
+            continue
+        settings[case.id] = found.key
+        if not case.settled:
+            cases[number] = with_others(case, found, workspace_of(out.absolute(), case))
     cases = mark_duplicates(cases, settings)
     if all(case.settled == "skipped" for case in cases):
         raise RequestError(
@@ -102,6 +110,56 @@ def make_plan(
             waiting.append(case)
     asked = (place, out, preset, overrides, stages, retry, keep)
     return Plan(cases, settings, records, waiting, retried, asked)
+
+
+def check_folder(out: Path, place: Path, cases: Sequence[Case], *, chosen: bool) -> None:
+    """Make sure that a folder does not hold another batch.
+
+    Cases may have moved, or have been copied; and in a folder that the user chose, cases of another
+    place may join those that are there.
+
+    Args:
+        chosen: whether the user named the folder.
+
+    Raises:
+        RequestError: it holds one, whose cases are still where they were.
+    """
+    before = _place_of(out)
+    if before is None or before.samefile(place):
+        return
+    if not chosen:
+        raise RequestError(
+            f"{out} holds the results of other cases, those of {before}. Choose another folder for "
+            f"the cases of {place}: -o. If they are the same cases, name this one: -o {out}."
+        )
+    for case in cases:
+        record = read_case(out, case.id)
+        if record is not None and _is_another(case, record):
+            raise RequestError(
+                f"{out} holds the results of other cases, those of {before}, and one of them has "
+                f"the name {case.name} too, with other photographs. Choose another folder for the "
+                f"cases of {place}: -o."
+            )
+
+
+def _place_of(out: Path) -> Path | None:
+    """Where the cases lie that a batch's folder was last used for, if they still are there."""
+    with suppress(OSError, ValueError):
+        told = read_json(out / BATCH)
+        if isinstance(told, dict) and isinstance(told.get("cases"), str):
+            place = Path(told["cases"])
+            return place if place.exists() else None
+    return None
+
+
+def _is_another(case: Case, record: Mapping[str, Any]) -> bool:
+    """Are a record's files still there, and none of the case's by its place or its size?"""
+    before = {value for path, size, _ in record["files"] for value in (path, size)}
+    now = {value for path, size, _ in case.files for value in (path, size)}
+    if not now or not before.isdisjoint(now):
+        return False
+    paths = [Path(path) for path, _, _ in record["files"]]
+    return any(path.is_absolute() and path.is_file() for path in paths)
 
 
 def _listed(place: Path, names: Names) -> list[Case]:

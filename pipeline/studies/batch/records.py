@@ -7,10 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.config import load_config, result_fields
-from pipeline.files import canonical_json, sha256_text
-from pipeline.installed import library_version
-from pipeline.stage import get_stage
 from pipeline.store import read_own, write_sealed
 
 #: State of a case -> what it means, as the summary says it.
@@ -34,6 +30,12 @@ FAILED = ("refused", "wrong", "fault", "killed")
 Settled = Literal["", "wrong", "duplicate", "skipped"]
 
 FOLDERS = ("cases", "records", "thumbnails", "logs")
+#: File of a batch's folder that says which one it is.
+BATCH = "batch.json"
+
+#: What a file beside the photographs is for, its path, bytes and time of change (ns); without a
+#: path: what is wrong with it.
+Other = tuple[str, str, int, int]
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class Case:
         images: what `pipeline run` is given.
         overrides: settings of its own.
         files: path, bytes and time of change (ns) of each photograph.
+        named: other files that its settings name.
+        put: files that a person has put into its workspace, as the teeth put right.
         settled: the state that it has before anything runs; empty: it is to be run.
         reason: why it is in that state.
         like: id of the case that it is the same as.
@@ -56,6 +60,8 @@ class Case:
     images: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     files: tuple[tuple[str, int, int], ...] = ()
+    named: tuple[Other, ...] = ()
+    put: tuple[Other, ...] = ()
     settled: Settled = ""
     reason: str = ""
     like: str = ""
@@ -68,33 +74,19 @@ class Case:
     def from_dict(cls, value: Mapping[str, Any]) -> Case:
         """What `to_dict` gave, after a way through JSON."""
         lists = {name: tuple(value[name]) for name in ("images", "overrides")}
-        return cls(**{**value, **lists, "files": tuple(map(tuple, value["files"]))})
+        files = {name: tuple(map(tuple, value[name])) for name in ("files", "named", "put")}
+        return cls(**{**value, **lists, **files})
 
     @property
     def stamps(self) -> list[list[Any]]:
-        """The files as a record has them."""
-        return [list(entry) for entry in self.files]
+        """All its files as a record has them."""
+        others = [[path or label, *stamp] for label, path, *stamp in (*self.named, *self.put)]
+        return [*map(list, self.files), *others]
 
 
-def settings_key(
-    preset: str | None, overrides: tuple[str, ...], stages: tuple[str, ...] | None
-) -> str:
-    """Hash of all that decides what comes of given photographs.
-
-    Raises:
-        RequestError: a setting is wrong.
-    """
-    config = load_config(preset, overrides)
-    names = stages or config.run.stages
-    told = {
-        "stages": {
-            name: [get_stage(name).version, result_fields(config.sections[name])] for name in names
-        },
-        "order": list(names),
-        "seed": config.run.seed,
-        "version": library_version("dentalsplat"),
-    }
-    return sha256_text(canonical_json(told))
+def workspace_of(out: Path, case: Case) -> Path:
+    """The folder of a case's own in that of a batch."""
+    return out / "cases" / case.id
 
 
 def record_path(out: Path, case: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import time
 import uuid
@@ -21,13 +22,21 @@ from pipeline.measure import usable_cores
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.store import Store
 from pipeline.store.locks import lock_of
-from pipeline.store.places import stage_folder
+from pipeline.store.places import remove, stage_folder
 from pipeline.studies.batch.cluster import check_workers, connected, require_dask, slots
-from pipeline.studies.batch.plan import Plan, make_plan
+from pipeline.studies.batch.keep import thumbnail_of
+from pipeline.studies.batch.plan import Plan, check_folder, make_plan
 from pipeline.studies.batch.progress import Lines, Silent, by_state
-from pipeline.studies.batch.records import FOLDERS, Case, new_record, read_case, write_case
+from pipeline.studies.batch.records import (
+    BATCH,
+    FOLDERS,
+    Case,
+    new_record,
+    read_case,
+    write_case,
+)
 from pipeline.studies.batch.summary import write_summary
-from pipeline.studies.batch.task import BATCH, run_case, stop
+from pipeline.studies.batch.task import run_case, stop
 from pipeline.untrusted.names import readable
 
 Keep = Literal["workspace", "results"]
@@ -73,8 +82,8 @@ def batch(
         ``{"folder", "cases": [record, ...], "counts": {state: number}, "seconds"}``.
 
     Raises:
-        RequestError: the request is wrong, another batch works in the folder, the disk is full, or
-            the scheduler is gone.
+        RequestError: the request is wrong, the folder is that of other cases, another batch works
+            in it, the disk is full, or the scheduler is gone.
     """
     require_dask()
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
@@ -82,7 +91,7 @@ def batch(
     if not isinstance(overrides, Mapping):
         texts = tuple(overrides)
     place = Path(cases)
-    folder = Path(out) if out is not None else Path("runs") / f"batch_{place.resolve().stem}"
+    folder = Path(out) if out is not None else Path("runs") / f"batch_{_called(place)}"
     progress = progress or Silent()
     start = time.perf_counter()
     named = tuple(stages) if stages else None
@@ -94,10 +103,12 @@ def batch(
         "verbose": progress.verbose,
     }  # fmt: skip
     plan = make_plan(place, folder, common["preset"], texts, named, retry, keep)
+    check_folder(folder, place, plan.cases, chosen=out is not None)
     with kept_for(share_for(folder, share)), _only_one(folder.absolute()) as home:
         plan = plan.again()  # what another batch has done meanwhile
-        session = uuid.uuid4().hex
-        found = {"id": session, "version": library_version("dentalsplat"), "cases": str(place)}
+        check_folder(folder, place, plan.cases, chosen=out is not None)
+        session, version = uuid.uuid4().hex, library_version("dentalsplat")
+        found = {"id": session, "version": version, "cases": str(place.resolve())}
         write_json(home / BATCH, found)
         common |= {"share": share_for(home), "session": session, "batch": session}
         work = _Work(plan, home, common, progress, f"Batch: {place.resolve().name}")
@@ -251,6 +262,7 @@ class _Work:
         else:
             why = f"A fault of ours on a worker: {type(error).__name__}: {error}"
             record = new_record(case, "fault", " ".join(why.split())[:600], **settings)
+        remove(thumbnail_of(self._home, case.id))
         write_case(self._home, record)
         return record
 
@@ -315,12 +327,17 @@ def _text(value: Any) -> str:
     return text.removesuffix("\n").removesuffix("\n...")
 
 
-def _memory_each(gigabytes: float | None, jobs: int, scheduler: str | None) -> int:
-    """Bytes for one case; 0: no limit, or that of the worker."""
+def _called(place: Path) -> str:
+    """Name of a folder of cases, with all its dots, or of a list without its suffix."""
+    return place.resolve().stem if place.is_file() else place.resolve().name
+
+
+def _memory_each(gigabytes: float | None, jobs: int, scheduler: str | None) -> int | None:
+    """Bytes for one case; 0: no limit; None: what a worker was given."""
     if gigabytes is not None:
-        return int(gigabytes * 1e9) or -1
+        return math.ceil(gigabytes * 1e9)
     if scheduler is not None:
-        return 0
+        return None
     import psutil
 
     return int(psutil.virtual_memory().total * 0.9 / jobs)

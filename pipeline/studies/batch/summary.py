@@ -96,6 +96,8 @@ def _row(
     shown = known.get(record["like"], record)
     place = f"cases/{shown['id']}"
     picture = f"thumbnails/{shown['id']}.jpg"
+    # that of a case which waits is of an earlier run
+    is_shown = shown["state"] != "waiting" and (out / picture).is_file()
     placed = None
     if record["placed"] is not None:
         placed = f"{record['placed']} of {record['photographs']}"
@@ -103,9 +105,10 @@ def _row(
         **record,
         "tone": TONES.get(record["state"], ""),
         "placed": placed,
+        "placed_number": record["placed"],
         "time": seconds(record["seconds"]),
         "overjet": record["measured"].get("overjet"),
-        "picture": quote(picture) if (out / picture).is_file() else "",
+        "picture": quote(picture) if is_shown else "",
         "links": [
             (quote(f"{place}/{path}{'/' if name == 'results' else ''}"), name)
             for name, path in shown["links"].items()

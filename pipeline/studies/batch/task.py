@@ -16,8 +16,17 @@ from typing import Any
 from pipeline.files import read_json
 from pipeline.installed import library_version, module_command
 from pipeline.process.privacy import kept_for
+from pipeline.store.places import remove
 from pipeline.studies.batch.child import DISK_FULL
-from pipeline.studies.batch.records import Case, new_record, read_case, write_case
+from pipeline.studies.batch.keep import thumbnail_of
+from pipeline.studies.batch.records import (
+    BATCH,
+    FINAL,
+    Case,
+    new_record,
+    read_case,
+    write_case,
+)
 
 #: So often is a case begun whose process was killed from outside, before it is given up.
 TRIES = 3
@@ -25,8 +34,6 @@ TRIES = 3
 WATCH = 0.25
 #: How the process of a case is started; tests have another.
 COMMAND: tuple[str, ...] = ()
-#: File of a batch's folder that says which one it is.
-BATCH = "batch.json"
 
 _lock = threading.Lock()
 _running: dict[int, tuple[str, subprocess.Popen[str]]] = {}
@@ -64,35 +71,47 @@ def run_case(job: dict[str, Any]) -> dict[str, Any]:
     trouble = look(job["out"], job["batch"])
     if trouble:
         return {"state": "unseen", "reason": trouble}
-    job = {**job, "threads": job["threads"] or _threads(), "memory": job["memory"] or _memory()}
+    memory = _memory() if job["memory"] is None else job["memory"]
+    job = {**job, "threads": job["threads"] or _threads(), "memory": memory}
+    tries = 0
     while True:
-        before = read_case(out, case.id)
-        tried = before is not None and before["session"] == job["session"]
-        lost = before["attempts"] if before is not None and tried else 0
-        if before is not None and before["state"] == "running" and lost >= TRIES:
+        before = _record(job, case)
+        lost = before["attempts"] if before is not None and before["state"] == "running" else 0
+        if max(lost, tries) >= TRIES:
             return _ended(
                 job, case, "killed",
                 f"Its process, or the worker that had started it, was killed from outside {TRIES} "
                 f"times, as a system does where memory runs out. Look into logs/{case.id}.txt, "
                 "give it a machine with more memory or fewer --jobs, and run with --retry failed.",
+                tries,
             )  # fmt: skip
         status, limit = _process(job, case)
+        tries += 1
         if job["session"] in _stopped:
             return new_record(case, "stopped")
-        record = read_case(out, case.id)
         if limit:
-            return _ended(job, case, "killed", limit)
+            return _ended(job, case, "killed", limit, tries)
         if status == DISK_FULL:
             return {"state": "full", "reason": _full(out)}
-        ours = record is not None and record["settings"] == job["settings"]
-        if record is not None and ours and record["state"] not in ("running", "waiting"):
+        record = _record(job, case)
+        if record is not None and record["state"] in FINAL:
             return record
         if status >= 0:
             return _ended(
                 job, case, "fault",
                 f"A fault of ours: its process ended without a result (exit status {status}). What "
                 f"it said last stands in logs/{case.id}.txt.",
+                tries,
             )  # fmt: skip
+
+
+def _record(job: dict[str, Any], case: Case) -> dict[str, Any] | None:
+    """What this batch has found out about exactly this case; None: nothing yet."""
+    record = read_case(Path(job["out"]), case.id)
+    if record is None or record["session"] != job["session"]:
+        return None
+    same = record["settings"] == job["settings"] and record["files"] == case.stamps
+    return record if same else None
 
 
 def stop(session: str) -> None:
@@ -187,15 +206,17 @@ def _kill(process: subprocess.Popen[str]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def _ended(job: dict[str, Any], case: Case, state: str, reason: str) -> dict[str, Any]:
-    before = read_case(Path(job["out"]), case.id) or {}
-    kept = {name: before[name] for name in ("contents", "attempts") if name in before}
+def _ended(job: dict[str, Any], case: Case, state: str, reason: str, tries: int) -> dict[str, Any]:
+    """The record of a case whose process left none."""
+    out, before = Path(job["out"]), _record(job, case)
     record = new_record(
         case, state, reason, settings=job["settings"], session=job["session"],
-        host=socket.gethostname(), **kept,
+        host=socket.gethostname(), contents=before["contents"] if before else [],
+        attempts=max(before["attempts"] if before else 0, tries),
     )  # fmt: skip
     with kept_for(job["share"]):
-        write_case(Path(job["out"]), record)
+        remove(thumbnail_of(out, case.id))
+        write_case(out, record)
     return record
 
 
