@@ -52,7 +52,10 @@ SYSTEM_LIBRARIES = {
 
 
 def doctor() -> list[Finding]:
-    """Check libraries, processor, GPU, disk and installation; nothing is changed."""
+    """Check libraries, processor, kernels, GPU, disk and installation.
+
+    Nothing is changed, but that a missing folder for compiled kernels is made.
+    """
     findings: list[Finding] = []
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _python,
@@ -60,6 +63,7 @@ def doctor() -> list[Finding]:
         _libraries,
         _cv2_wheels,
         _processor,
+        _numba_cache,
         _gpu,
         _stages,
         _disk,

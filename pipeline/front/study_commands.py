@@ -248,6 +248,8 @@ def dicom_command(
             print(f"{written.folder / name}: {title}")
         for name, why in written.left_out.items():
             print(f"{name} was not written: {why}")
+        for name in written.removed:
+            print(f"{name}, of an earlier call, was removed.")
     if written.problems:
         print("\n".join(written.problems), file=sys.stderr)
         raise typer.Exit(1)

@@ -95,6 +95,11 @@ def draw(
     return Chart(_for_the_page(stream.getvalue(), alt), alt, caption)
 
 
+def _plain(text: str) -> str:
+    """A text as matplotlib shows it as it is: between two dollar signs it would read formulas."""
+    return text.replace("$", r"\$")
+
+
 def _for_the_page(text: str, alt: str) -> str:
     from markupsafe import escape
 
@@ -134,12 +139,14 @@ def match_matrix(names: Sequence[str], table: Mapping[tuple[int, int], int]) -> 
     for (i, j), value in table.items():
         counts[i, j] = counts[j, i] = value
 
+    shown_names = [_plain(name) for name in names]
+
     def paint(axes: Axes) -> None:
         axes.grid(visible=False)
         shown = np.log10(np.maximum(counts, 0) + 1)
         axes.imshow(shown, cmap="YlGnBu", vmin=0, vmax=max(1.0, np.nanmax(shown, initial=0)))
-        axes.set_xticks(range(count), names, rotation=90 if count > 6 else 0)
-        axes.set_yticks(range(count), names)
+        axes.set_xticks(range(count), shown_names, rotation=90 if count > 6 else 0)
+        axes.set_yticks(range(count), shown_names)
         axes.tick_params(length=0, labelsize=10 if count <= 14 else 7)
         if count <= 14:
             middle = 0.55 * max(1.0, float(np.nanmax(shown, initial=0)))
@@ -200,14 +207,17 @@ def camera_plot(
                 path = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
                 axes.plot(
                     path[:, 0], path[:, 1], color=color, lw=1.4 if last else 0.9,
-                    ls="-" if last else (0, (3, 2)), label=name if position == 0 else None,
+                    ls="-" if last else (0, (3, 2)), label=_plain(name) if position == 0 else None,
                     solid_joinstyle="round",
                 )  # fmt: skip
                 if last and len(several) <= 30:
                     away = corners[0] - corners[1:].mean(0)
                     away = away / max(float(np.linalg.norm(away)), 1e-12) * depth * 0.5
                     x, y = corners[0] + away
-                    axes.text(x, y, camera.name, ha="center", va="center", fontsize=9, color=color)
+                    axes.text(
+                        x, y, _plain(camera.name), ha="center", va="center", fontsize=9,
+                        color=color,
+                    )  # fmt: skip
         axes.use_sticky_edges = False
         axes.margins(0.06)
         axes.set_aspect("equal", adjustable="datalim")
@@ -265,7 +275,7 @@ def line_chart(
 
     def paint(axes: Axes) -> None:
         for number, (name, values) in enumerate(lines.items()):
-            axes.plot(x, values, color=SERIES[number % len(SERIES)], lw=1.8, label=name)
+            axes.plot(x, values, color=SERIES[number % len(SERIES)], lw=1.8, label=_plain(name))
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])
         every = [value for values in lines.values() for value in values]
@@ -306,7 +316,7 @@ def series_chart(
                     x, [values[k] for k in x], ls=style, color=color[name], lw=1.6, ms=5,
                     marker=marks[names.index(name) % len(marks)],
                     markerfacecolor=color[name] if style == "-" else "none",
-                    label=name if style == "-" or name not in series else None,
+                    label=_plain(name) if style == "-" or name not in series else None,
                 )  # fmt: skip
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])
@@ -347,7 +357,7 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, caption: str = "") -> C
                 axes.annotate("failed", (0, row), (4, 0), textcoords="offset points", va="center")
             if bar.other is not None:
                 axes.plot([bar.other] * 2, [row - 0.42, row + 0.42], color=SERIES[1], lw=3)
-        axes.set_yticks(range(len(bars)), [bar.name for bar in bars])
+        axes.set_yticks(range(len(bars)), [_plain(bar.name) for bar in bars])
         axes.set_ylim(len(bars) - 0.4, -0.6)
         axes.set_xlabel(label)
         axes.grid(visible=False, axis="y")

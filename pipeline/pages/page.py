@@ -71,11 +71,10 @@ def seconds(value: float | None) -> str:
     """A time for people: ``0.4 s``, ``12 s``, ``3 min 20 s``."""
     if value is None:
         return "–"
-    if value < 10:
+    if round(value, 1) < 10:
         return f"{value:.1f} s"
-    if value < 120:
-        return f"{value:.0f} s"
-    return f"{int(value // 60)} min {value % 60:.0f} s"
+    whole = round(value)
+    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60} s"
 
 
 def write_page(package: str, template: str, out: Path, **content: Any) -> Path:

@@ -6,6 +6,7 @@ import base64
 import binascii
 import contextlib
 import getpass
+import json
 import re
 import socket
 import time
@@ -20,9 +21,11 @@ from PIL import Image
 
 import pipeline
 from pipeline.running.outcomes import RunSummary
+from pipeline.store.failures import Failures
 from pipeline.studies.dicom import write_dicom
 from pipeline.studies.report import run_report
 from tests.personal_data import DATE, PERSONAL
+from tests.studies import report_case
 
 #: Runs of base64 that are long enough to hold a picture or a name.
 BASE64 = re.compile(rb"[A-Za-z0-9+/]{40,}={0,2}")
@@ -125,6 +128,63 @@ def test_texts_without_names(said: object, shown: object) -> None:
 
     places = {"Prognath_Anna_left.jpg": "002", "Prognath_Anna_left": "002", "Prognath": "[name]"}
     assert Secrets(places).hide(said) == shown
+
+
+def test_paths_with_spaces_and_the_folders_on_the_way(tmp_path: Path) -> None:
+    """What no sentence tells the end of: the request and the settings do."""
+    from pipeline.pages.anonymous import secrets_of
+    from pipeline.pages.case import Case
+
+    workspace = tmp_path / "Otto Meier" / "visit 2"
+    masks = "/data/Anna Müller/visit1/masks"
+    request = {
+        "images": ["/data/Jo O'Hara/June 3/IMG 1.jpg"], "preset": None,
+        "overrides": [f"evaluate.masks={masks}", "init.pointmap.files=../Eva Kern/maps"],
+    }  # fmt: skip
+    hide = secrets_of(Case(workspace, request, ())).hide
+    for said, shown in {
+        f"--set views.masks={masks}": "--set views.masks=[path]",
+        f"{masks}/left side.png is no mask": "[path] side.png is no mask",
+        "/data/Anna Müller/visit1/teeth.json is damaged": "[path] is damaged",
+        'mesh="/data/Anna M\\xFCller/visit1"': 'mesh="[path]"',
+        "files: '/data/Jo O''Hara/June 3'": "files: '[path]'",
+        "the folder June 3 of Anna Müller": "the folder [name] of [name]",
+        f"Pictures: {workspace}/init/failure.": "Pictures: [path]",
+        "No such file: '/srv/Max Roth/b c.png'": "No such file: '[path]'",
+        "../Eva Kern/maps": "[path]",
+        "the data of a mouth, 3 of 4, 1/2": "the data of a mouth, 3 of 4, 1/2",
+    }.items():
+        assert hide(said) == shown
+
+
+def test_photographs_that_no_stage_could_use_are_not_named(tmp_path: Path) -> None:
+    from pipeline.pages.anonymous import secrets_of
+    from pipeline.pages.case import Case
+
+    (tmp_path / "given").mkdir()
+    (tmp_path / "given" / "Anna_left.jpg").write_bytes(b"")
+    for images in (str(tmp_path / "given"), str(tmp_path / "given" / "*.jpg")):
+        request = {"images": [images], "preset": "paper", "overrides": []}
+        hide = secrets_of(Case(tmp_path / "w", request, ())).hide
+        assert hide("Anna_left.jpg is too small. -c paper") == "[name] is too small. -c paper"
+
+
+def test_settings_of_a_report_without_names(tmp_path: Path) -> None:
+    """Also where the page folds a long path into two lines."""
+    workspace = report_case.write_case(tmp_path / "Otto Meier", ("views", "init", "fit"))
+    path = workspace / "request.json"
+    request = json.loads(path.read_text())
+    masks = "/data/Anna Müller/and so on and on and on and on and on and on and on/Max Roth/masks"
+    request["overrides"] += [f"evaluate.masks={masks}", "evaluate.mesh=/data/Eva Kern/mesh.ply"]
+    request["stages"] = [*request["stages"], "evaluate"]
+    path.write_text(json.dumps(request))
+    Failures(workspace).record("evaluate", "key", f"{masks} has no mask of left.jpg.")
+    page = run_report(workspace, anonymous=True).read_text()
+    assert "[path] has no mask of 001." in page
+    assert "--set evaluate.masks=[path]" in page
+    assert "mesh: &#39;[path]&#39;" in page
+    words = set(re.split(r"\W+", page))
+    assert not words & {"Otto", "Meier", "Anna", "Müller", "Max", "Roth", "Eva", "Kern"}
 
 
 PHOTOS = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"

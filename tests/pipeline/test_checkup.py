@@ -41,6 +41,16 @@ def test_two_cv2_wheels_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(checkup._cv2_wheels())
 
 
+def test_kernels_that_cannot_be_kept_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    others = ("_system_libraries", "_libraries", "_gpu", "_stages", "_disk")
+    for name in others:
+        monkeypatch.setattr(checkup, name, lambda: iter(()))
+    assert by_name(checkup.doctor())["kernel cache"].level == "ok"
+    monkeypatch.setattr("pipeline.kernels.folder.writable", lambda: None)
+    told = by_name(checkup.doctor())["kernel cache"]
+    assert told.level == "note" and "NUMBA_CACHE_DIR" in told.mend
+
+
 def test_no_stages_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.stage._entry_points", dict)
     assert any(finding.level == "problem" for finding in checkup._stages())

@@ -174,6 +174,7 @@ TROUBLES: dict[str, tuple[dict[str, Any], str, str]] = {
     "request": ({"fit.fail": "request"}, "refused", "can't be done"),
     "empty": ({"evaluate.broken": True}, "fault", "holds no mean figures"),
     "needy": ({"init.needs": 3}, "failed", "COLMAP could not place"),
+    "nowhere": ({"views.masks": "/nowhere/masks"}, "refused", "no folder /nowhere/masks"),
 }
 
 
@@ -211,7 +212,7 @@ def test_a_method_that_fails_is_a_result_and_a_fault_is_a_problem(troubled: Any,
 def test_neither_stops_the_others_and_only_a_fault_is_tried_again(troubled: Any) -> None:
     results, _, second = troubled
     assert [(c["method"], c["status"]) for c in results["cells"]][-1] == ("poor", "done")
-    assert len(results["problems"]) == 4
+    assert len(results["problems"]) == 5
     # "empty" had its figures before; "needy" would fail again.
     again = [(stage, config.get("fail")) for stage, config in second]
     assert again == [("fit", "bug"), ("fit", "killed"), ("fit", "request")]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,14 @@ import pytest
 from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.views import write_png
 from pipeline.errors import RequestError
+from pipeline.pages.case import Case, StageRecord
+from pipeline.store import Result, Store
+from pipeline.store.failures import Failures
 from pipeline.studies.dicom import write_dicom
+from pipeline.studies.dicom.exports import exports_of
 from pipeline.workspace import Request
 from tests.personal_data import PERSONAL
+from tests.studies import report_case
 
 pydicom = pytest.importorskip("pydicom")
 writing: Any = pytest.importorskip("pipeline.studies.dicom.writing")
@@ -168,6 +175,73 @@ def test_no_run_no_files(tmp_path: Path) -> None:
     (other / "dicom").write_text("in the way")
     with pytest.raises(RequestError, match="can't be written to"):
         write_dicom(other, views=0)
+
+
+def test_a_folder_holds_one_study(tmp_path: Path) -> None:
+    """What an earlier call left goes, under whatever options; nobody else's files do."""
+    folder, out = workspace(tmp_path / "w"), tmp_path / "out"
+    write_dicom(folder, out, patient={"PatientID": "A"}, views=0)
+    (out / "notes.txt").write_text("kept")
+    (out / "model_of_stone.dcm").write_bytes(b"no DICOM file")
+    other = read(out, "preview.dcm")
+    other.file_meta.ImplementationClassUID = "1.2.3"
+    other.save_as(out / "view_003.dcm")
+    (folder / "results" / "mesh.stl").unlink()
+    written = write_dicom(folder, out, patient={"PatientID": "B"}, views=0)
+    assert written.removed == ("mesh.dcm",) and read(out, "preview.dcm").PatientID == "B"
+    left = {path.name for path in out.iterdir()}
+    assert left == {"notes.txt", "model_of_stone.dcm", "view_003.dcm", "preview.dcm"}
+    other.save_as(out / "preview.dcm")
+    with pytest.raises(RequestError, match="not written by this command"):
+        write_dicom(folder, out, views=0)
+    assert read(out, "preview.dcm").PatientID == "A"
+
+
+def test_a_run_that_failed_before_its_exports_is_refused(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "w")
+    Failures(folder).record("evaluate", "key", "after the exports")
+    assert write_dicom(folder, views=0).files
+    Failures(folder).record("fit", "key", "too dark")
+    with pytest.raises(RequestError, match="the last run ended in fit"):
+        write_dicom(folder, tmp_path / "out", views=0)
+    assert not (tmp_path / "out").exists()
+
+
+def scene(folder: Path) -> list[StageRecord]:
+    """A run of two stages, as its workspace has it."""
+    report_case.write_result(folder, "fit", [report_case.points(5)])
+    source = {"points": {"stage": "fit", "content": result_of(folder, "fit").contents["points"]}}
+    report_case.write_result(folder, "export", [], {"exports/scene.json": b"{}"}, inputs=source)
+    return [
+        StageRecord(name, "cached", (), None, result_of(folder, name)) for name in ("fit", "export")
+    ]
+
+
+def result_of(folder: Path, stage: str) -> Result:
+    found = Store(folder).current(stage)
+    assert found is not None
+    return found
+
+
+def test_exports_are_those_that_the_last_request_leads_to(tmp_path: Path) -> None:
+    fit, export = scene(tmp_path)
+    place = export.result and export.result.folder / "exports"
+
+    def found(*records: StageRecord) -> Path:
+        return exports_of(Case(tmp_path, {}, records))
+
+    assert found(fit, export) == place
+    stopped = replace(fit, state="stale", reasons=("fit.iterations 5 → 9",))
+    waiting = replace(export, state="pending")
+    with pytest.raises(RequestError, match=r"'fit' has yet to run \(fit.iterations 5 → 9\)"):
+        found(stopped, waiting)
+    newer = ("library numba 1 → 2", "fit version 3 → 4", "fit.speed (absent) → 1")
+    assert found(replace(fit, state="stale", reasons=newer), waiting) == place
+    assert found(fit) == place, "a request that ends before the exports, of the fit that they show"
+    shutil.rmtree(tmp_path / "fit")
+    report_case.write_result(tmp_path, "fit", [report_case.points(6)])
+    with pytest.raises(RequestError, match="'fit' has another result by now"):
+        found(fit)
 
 
 def test_reading_back_finds_what_is_wrong(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from pipeline.studies.register.geometry import first_frame
 from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
+from pipeline.studies.register.writing import described
 from tests.studies.register_case import motion, toy_centres, toy_motions, toy_visit
 
 
@@ -174,6 +175,31 @@ def test_doubt_grows_as_pictures_agree_less() -> None:
 def test_the_scale_between_the_runs_comes_out(found: comparing.Comparison) -> None:
     assert found.relative_scale == pytest.approx(1 / 1.07, rel=2e-3)
     assert scale_of(found.first_from_second) == found.relative_scale
+
+
+@pytest.mark.parametrize(
+    ("doubts", "factor"),
+    [((None, 2.0), 1.07), ((2.0, None), 1.0), ((None, 10.0), 1.0), ((10.0, None), 1.07)],
+)
+def test_the_surer_scale_counts_and_how_far_the_first_run_was_scaled_is_said(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch,
+    doubts: tuple[float | None, float | None], factor: float,
+) -> None:  # fmt: skip
+    """Cameras in millimetres come before textbook teeth, and after a length."""
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: tuple(ways))
+    first, second = (
+        replace(visit, scale_percent=doubt, scale_source=f"{doubt}")
+        for visit, doubt in zip((found.first, found.second), doubts, strict=True)
+    )
+    again = compare_visits(first, second)
+    said = described(again)
+    surer = 2.0 if 2.0 in doubts else None
+    assert (said["scale_deviation_percent"], said["scale_source"]) == (surer, f"{surer}")
+    assert said["relative_scale"] == pytest.approx(1 / 1.07, rel=2e-3)
+    assert said["first_scaled_by"] == pytest.approx(factor, rel=5e-3)
+    assert scale_of(again.first_from_second) == pytest.approx(factor / 1.07, rel=5e-3)
+    for number, centre in again.first.centres.items():
+        assert centre == pytest.approx(again.first_scaled_by * first.centres[number])
 
 
 def test_teeth_that_stood_still_lie_on_each_other_in_one_frame(

@@ -69,7 +69,9 @@ def test_the_command_writes_table_page_and_mesh(written: tuple[Path, Result]) ->
     at = next(np.array(t["at"]) for t in said["teeth"] if t["fdi"] == 12)
     true = np.linalg.norm(solving.displacement(toy_motions()[12], at)[:3])
     assert float(rows[12]["distance_mm"]) == pytest.approx(true, abs=0.15)
+    assert said["scale_deviation_percent"] is None and said["first_scaled_by"] == 1
     page = (out / "register.html").read_text()
+    assert "how far these may be off is not known" in page and ">unknown<" in page
     assert page.count("data:image/jpeg") == 9
     assert "http" not in page.replace("http-equiv", "")
     assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,16 @@ import pipeline
 from pipeline.artifacts.metrics import Scores
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.world import move_camera
+from pipeline.pages.charts import (
+    Bar,
+    bar_chart,
+    camera_plot,
+    line_chart,
+    match_matrix,
+    series_chart,
+)
 from pipeline.pages.directions import movement, similarity_onto
+from pipeline.pages.page import seconds
 from pipeline.pages.pictures import picture, points_image, thirds
 from pipeline.pages.tables import views_table
 from pipeline.running.outcomes import RunSummary
@@ -72,6 +82,31 @@ def test_names_and_warnings_are_text_and_not_markup(tmp_path: Path) -> None:
     assert "2 of 3 photographs placed in space" in text
     assert "1 of 3 photographs could not be placed and are not part of the scene: right.jpg" in text
     assert re.search(r"not placed 1 of 3 photographs could not be placed: right", text)
+
+
+def test_dollars_in_names_are_no_formula() -> None:
+    name = "scan_$1_$2.jpg"
+    places = [replace(case.camera(name, 0.0), name=name), case.camera("b", 30.0)]
+    nothing = np.zeros((0, 3))
+    for chart in (
+        match_matrix([name, "b"], {(0, 1): 5}),
+        camera_plot([(name, places, None), ("b", places, None)], nothing, nothing, "top"),
+        line_chart([0, 1], {name: [1, 2], "b": [2, 1]}, ("x", "y"), "lines"),
+        series_chart({name: {1: 2, 2: 3}}, ("x", "y"), "series", dashed={"$_$": {1: 2}}),
+        bar_chart([Bar(name, 1.0)], "x", "bars"),
+    ):
+        assert f">{name}<" in chart.svg, chart.alt
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (None, "–"), (0.44, "0.4 s"), (9.97, "10 s"), (12.4, "12 s"), (119.7, "2 min 0 s"),
+        (179.7, "3 min 0 s"), (200, "3 min 20 s"), (3599.6, "60 min 0 s"),
+    ],
+)  # fmt: skip
+def test_times_are_rounded_before_they_are_split(value: float | None, said: str) -> None:
+    assert seconds(value) == said
 
 
 def test_stages_that_did_not_run_leave_no_gap(tmp_path: Path) -> None:

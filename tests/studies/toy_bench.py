@@ -38,8 +38,11 @@ class ViewsStage(Stage):
 
     class Config(StageConfig):
         held_out: tuple[str, ...] = ()
+        masks: str | None = runtime(None)
 
     def sources(self, config: Any, request: Any) -> dict[str, Path]:
+        if config.masks is not None and not Path(config.masks).is_dir():
+            raise RequestError(f"There is no folder {config.masks}.")
         return {Path(p).name: Path(p) for p in request["images"]}
 
     def run(self, context: StageContext) -> None:

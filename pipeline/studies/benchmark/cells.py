@@ -242,11 +242,20 @@ def run_cell(cell: Cell, out: Path, threads: int, reporter: Reporter) -> dict[st
         return record | {"status": "done", "keys": keys, **_figures(cell, results, actions, out)}
     except PipelineError as error:
         status = {2: "refused", 3: "failed"}.get(error.exit_status, "fault")
+        return record | {"status": status, "reason": str(error), **_as_far_as_it_came(cell, out)}
+
+
+def _as_far_as_it_came(cell: Cell, out: Path) -> dict[str, Any]:
+    """The stages of a cell that has no figures; none where its request can't even be planned."""
+    try:
         planned = plan_stages(cell, out)
-        keys = {stage.name: stage.key for stage in planned if stage.key is not None}
-        ran = [stage.result for stage in planned if stage.result is not None]
-        told = [_stage_entry(result, "", out) for result in ran]
-        return record | {"status": status, "reason": str(error), "keys": keys, "stages": told}
+    except PipelineError:
+        planned = []
+    ran = [stage.result for stage in planned if stage.result is not None]
+    return {
+        "keys": {stage.name: stage.key for stage in planned if stage.key is not None},
+        "stages": [_stage_entry(result, "", out) for result in ran],
+    }
 
 
 def unfinished_record(cell: Cell, reason: str) -> dict[str, Any]:

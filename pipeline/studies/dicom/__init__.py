@@ -24,15 +24,16 @@ def write_dicom(
 
     Args:
         workspace: with a finished run up to `export`.
-        out: folder for them; default ``WORKSPACE/dicom``. Files of the same names are replaced.
+        out: folder for them; default ``WORKSPACE/dicom``. What an earlier call wrote there goes.
         patient: DICOM keyword -> value, of `identity.GIVEN` (``PatientID``, ...). Without any, the
             files say of nobody whose teeth they show, and that identity was removed.
         views: how many places of the walk around the scene to show.
         unscaled: also write a mesh on which nothing can be measured.
 
     Raises:
-        RequestError: the extra is missing, the run has no exports, a value is not what DICOM
-            allows, or the folder can't be written.
+        RequestError: the extra is missing, the run has no exports or they are not what it was last
+            asked for, a value is not what DICOM allows, or the folder can't be written or holds
+            another program's file of such a name.
     """
     from pipeline.installed import require
     from pipeline.process.privacy import kept_for, share_for

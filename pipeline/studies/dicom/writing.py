@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
+import struct
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +13,19 @@ import numpy as np
 import numpy.typing as npt
 import pydicom
 from pydicom.dataset import Dataset
+from pydicom.errors import BytesLengthException, InvalidDicomError
+from pydicom.filereader import read_file_meta_info
 
 from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.files import read_json, temporary_beside
-from pipeline.studies.dicom.identity import checked, valid_uid
+from pipeline.pages.case import Case
+from pipeline.store.places import is_there
+from pipeline.studies.dicom.exports import exports_of
+from pipeline.studies.dicom.identity import checked, uid, valid_uid
 from pipeline.studies.dicom.objects import Picture, Solid, data_sets
 from pipeline.studies.dicom.written import Written
+from pipeline.studies.report.reading import read_case
 from pipeline.workspace import is_workspace
 
 #: Surfaces whose names begin so are not as the reconstruction has them: closed, with a base.
@@ -26,6 +35,13 @@ _Z_UP_AXES = {
     "mouth": "x left, y back, z head",
     "upright": "x right, y away, z up",
 }
+#: What pydicom raises at a head that is none.
+UNREADABLE = (
+    AttributeError, BytesLengthException, EOFError, InvalidDicomError, NotImplementedError,
+    ValueError, struct.error,
+)  # fmt: skip
+#: What this command calls its files.
+OWN_NAMES = re.compile(r"(preview|view_\d{3}|mesh\w*|model\w*)\.dcm")
 #: Bytes before the triangles of a binary STL, and their layout.
 _STL_HEAD = 84
 _TRIANGLE = np.dtype([("vectors", "<f4", (4, 3)), ("spare", "<u2")])
@@ -41,7 +57,8 @@ def write_all(
             f"{workspace} is not a workspace: no run has been started there. Give the folder that "
             "'pipeline run' named, with -w."
         )
-    results = workspace / "results"
+    case = read_case(workspace)
+    results = exports_of(case)
     scene = read_json(results / "scene.json")
     if not isinstance(scene, dict):
         raise RequestError(
@@ -50,7 +67,7 @@ def write_all(
         )
     scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
     solids, left_out = _solids(results, scale, scene.get("frame", {}), unscaled)
-    pictures = [*_preview(results), *_views(workspace, views)]
+    pictures = [*_preview(results), *_views(case, views)]
     if not pictures and not solids:
         raise RequestError(
             f"{results} holds nothing that becomes a DICOM file: no preview and no mesh with a "
@@ -60,6 +77,7 @@ def write_all(
     problems: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        before = clear(folder, made)
         for name, dataset in made.items():
             _write(folder / name, dataset)
             problems += [f"{name}: {text}" for text in read_back(folder / name, dataset)]
@@ -70,7 +88,8 @@ def write_all(
         ) from error
     titles = {picture.name: picture.title for picture in pictures}
     titles |= {solid.name: solid.title for solid in solids}
-    return Written(folder, titles, left_out, tuple(problems))
+    removed = tuple(name for name in before if name not in made)
+    return Written(folder, titles, left_out, tuple(problems), removed)
 
 
 def _solids(
@@ -123,15 +142,13 @@ def _preview(results: Path) -> list[Picture]:
     return [Picture("preview.dcm", title, _colours(read_png(path)))]
 
 
-def _views(workspace: Path, count: int) -> list[Picture]:
+def _views(case: Case, count: int) -> list[Picture]:
     """The scene from places of the walk around it, as the workspace holds it."""
     from pipeline.artifacts.space.frames import frame_of
     from pipeline.measure import usable_cores
-    from pipeline.studies.report.reading import read_case
     from stages.export.pictures.orbits import between
     from stages.export.scene import assemble
 
-    case = read_case(workspace)
     views, cameras, gaussians = (case.latest(kind) for kind in ("views", "cameras", "gaussians"))
     if count < 1 or views is None or cameras is None or gaussians is None or not len(cameras):
         return []
@@ -154,6 +171,42 @@ def _colours(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, -1)
     return np.ascontiguousarray(pixels[..., :3], np.uint8)
+
+
+def clear(folder: Path, names: Iterable[str]) -> list[str]:
+    """Delete what an earlier call wrote into a folder: files of two patients are no study.
+
+    What another program wrote stays.
+
+    Args:
+        names: of files that are to be written.
+
+    Returns:
+        Names of what was deleted.
+
+    Raises:
+        RequestError: another program wrote a file of such a name; nothing was deleted.
+    """
+    found = [path for path in sorted(folder.glob("*.dcm")) if _is_ours(path)]
+    for path in (folder / name for name in names):
+        if path not in found and is_there(path):
+            raise RequestError(
+                f"{path} was not written by this command and is not replaced. Name another folder "
+                "with -o."
+            )
+    for path in found:
+        path.unlink()
+    return [path.name for path in found]
+
+
+def _is_ours(path: Path) -> bool:
+    if not OWN_NAMES.fullmatch(path.name) or path.is_symlink() or not path.is_file():
+        return False
+    try:
+        mark = read_file_meta_info(path).ImplementationClassUID
+    except UNREADABLE:
+        return False
+    return bool(mark == uid("dentalsplat"))
 
 
 def _write(path: Path, dataset: Dataset) -> None:

@@ -16,9 +16,11 @@ class Written:
         files: name -> what it is.
         left_out: name of a mesh -> why it was not written.
         problems: what reading the files back found wrong; empty: nothing.
+        removed: files of an earlier call that lay in the folder and were not written anew.
     """
 
     folder: Path
     files: Mapping[str, str]
     left_out: Mapping[str, str]
     problems: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()

@@ -65,6 +65,7 @@ def _registered(
 ) -> tuple[Comparison, Path]:
     """Compare, and write what came of it."""
     from pipeline.errors import RequestError
+    from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.register.comparing import compare_visits
     from pipeline.studies.register.page.writing import write_register_page
     from pipeline.studies.register.visit import read_visit
@@ -79,9 +80,10 @@ def _registered(
     found = compare_visits(visits[0], visits[1])
     hears.progress(NAME, "write", len(visits) + 1, steps)
     folder = Path(out) if out is not None else workspaces[1] / "register"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_files(found, folder)
-    except OSError as error:
-        raise RequestError(f"{folder} can't be written to ({error.strerror}).") from error
-    return found, write_register_page(found, folder)
+    with kept_for(share_for(workspaces[1])):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_files(found, folder)
+        except OSError as error:
+            raise RequestError(f"{folder} can't be written to ({error.strerror}).") from error
+        return found, write_register_page(found, folder)

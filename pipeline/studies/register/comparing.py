@@ -89,8 +89,11 @@ class Comparison:
         likeness, share, residual: what the decision that it is one patient stands on: median
             correlation of crowns' surroundings; share of the teeth that agree with one frame;
             median distance of crown from crown, mm.
-        scale_percent: standard deviation of all lengths together, percent; scale_source: whose.
-        relative_scale: size of the second run's millimetre in the first's.
+        scale_percent: standard deviation of all lengths together, percent; None: not known.
+        scale_source: whose.
+        relative_scale: size of the second run's millimetre in the first's, as the runs have them.
+        first_scaled_by: what the first run's lengths were multiplied by: 1, or as many of the
+            second's millimetres as one of its own is, where the second's are the surer ones.
     """
 
     first: Visit
@@ -101,9 +104,10 @@ class Comparison:
     likeness: float
     share: float
     residual: float
-    scale_percent: float
+    scale_percent: float | None
     scale_source: str
     relative_scale: float
+    first_scaled_by: float
 
     @property
     def still(self) -> list[int]:
@@ -118,8 +122,10 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
         ReconstructionError: they are of two patients, or share too few teeth.
     """
     frame, agreeing = _frame(first, second)
-    if second.scale_percent < first.scale_percent:  # the surer millimetre counts for both
-        first = first.in_frame(np.diag([1 / scale_of(frame)] * 3 + [1.0]))
+    surer, scaled_by = first, 1.0
+    if second.scale_doubt < first.scale_doubt:  # the surer millimetre counts for both
+        surer, scaled_by = second, 1 / scale_of(frame)
+        first = first.in_frame(np.diag([scaled_by] * 3 + [1.0]))
         frame, agreeing = _frame(first, second)
     share = len(agreeing) / len(set(first.centres) & set(second.centres))
     frame = refined_frame(first, second, frame, agreeing)
@@ -141,11 +147,10 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
     joint = refined_frame(first, second, frame, there.still)
-    surer = first if first.scale_percent <= second.scale_percent else second
     return Comparison(
         first, second, joint, teeth, tuple(sorted(missing)), likeness, share,
         max(there.residual, back.residual), surer.scale_percent, surer.scale_source,
-        scale_of(joint),
+        scale_of(joint) / scaled_by, scaled_by,
     )  # fmt: skip
 
 

@@ -28,6 +28,9 @@ LEAST_ALPHA = 0.5
 LEAST_PIXELS = 40
 #: Share of a tooth's points, by depth, that may be off: what outlines take in beside the tooth.
 TRIMMED = 0.04
+#: Cameras given in millimetres don't say how sure they are: surer than textbook teeth (10 %), less
+#: so than a length that somebody has measured (1 %).
+UNSAID_PERCENT = 5.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class Visit:
         name: for messages.
         looks: photographs with cameras and teeth, in the order of the run.
         teeth: FDI number -> [N, 3] points of its crown's enamel, mm.
-        scale_percent: relative standard deviation of its millimetres, percent.
+        scale_percent: relative standard deviation of its millimetres, percent; None: not known.
         scale_source: where millimetres come from, in words.
         gaussians: the scene, in the run's own world; None in tests.
         frame: [4, 4] similarity from that world to this frame.
@@ -94,11 +97,16 @@ class Visit:
     name: str
     looks: tuple[Look, ...]
     teeth: Mapping[int, Array]
-    scale_percent: float = 0.0
+    scale_percent: float | None = None
     scale_source: str = ""
     gaussians: Gaussians | None = None
     frame: Array = field(default_factory=lambda: np.eye(4))
     covered: Mapping[int, Array] = field(default_factory=dict)
+
+    @property
+    def scale_doubt(self) -> float:
+        """`scale_percent` to compare visits by."""
+        return UNSAID_PERCENT if self.scale_percent is None else self.scale_percent
 
     def in_frame(self, frame: Array) -> Visit:
         """The visit in a frame that a similarity [4, 4] leads to."""
@@ -178,7 +186,7 @@ def read_visit(workspace: Path) -> Visit:
     made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians)
     made = made.in_frame(frame)
     made = without_braces(made, pictures)
-    return replace(made, scale_percent=float(percent or 0.0), scale_source=source)
+    return replace(made, scale_percent=percent, scale_source=source)
 
 
 def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:

@@ -20,8 +20,11 @@ from pipeline.studies.register.visit import Look
 Array = npt.NDArray[np.float64]
 FORMAT = "dentalsplat register 1"
 NOTES = {
-    "frame": "the first visit's, millimetres, OpenCV axes as its run found them; "
-    "first_from_second leads there from the second's",
+    "frame": "the first visit's, millimetres, OpenCV axes as its run found them, its lengths times "
+    "first_scaled_by (other than 1 where the second run's millimetre is the surer one); "
+    "first_from_second leads there from the second's, 'at' and 'motion' are in it",
+    "relative_scale": "size of the second run's millimetre in the first's, as the runs have them",
+    "scale_deviation_percent": "null: how far the millimetres may be off is not known",
     "parts": "mesial (distal), buccal (lingual), extrusion (intrusion) of the point 'at' in mm; "
     "tip (edge to the mesial side), torque (edge outwards), rotation (mesial side outwards), "
     "degrees",
@@ -36,6 +39,7 @@ FARTHEST = 1.5
 
 def described(found: Comparison) -> dict[str, Any]:
     """The content of register.json."""
+    percent = found.scale_percent
     return {
         "format": FORMAT,
         "first": found.first.name,
@@ -43,8 +47,9 @@ def described(found: Comparison) -> dict[str, Any]:
         "notes": NOTES,
         "units": "mm",
         "scale_source": found.scale_source,
-        "scale_deviation_percent": round(found.scale_percent, 2),
+        "scale_deviation_percent": None if percent is None else round(percent, 2),
         "relative_scale": round(found.relative_scale, 5),
+        "first_scaled_by": round(found.first_scaled_by, 5),
         "first_from_second": np.round(found.first_from_second, 6).tolist(),
         "reference": found.still,
         "same_patient": {

@@ -179,14 +179,15 @@ def settings(case: Case) -> list[tuple[str, str]]:
     """(stage, its resolved settings as YAML): of its result, or of the next run."""
     found = []
     if case.run_settings is not None:
-        found.append(("run", _yaml(case.run_settings.model_dump(mode="json"))))
+        found.append(("run", case.run_settings.model_dump(mode="json")))
     for record in case.stages:
         values = record.manifest.get("config")
         if values is None and record.name in case.settings:
             values = case.settings[record.name].model_dump(mode="json")
         if values is not None:
-            found.append((record.name, _yaml(values)))
-    return [(name, case.hide(text)) for name, text in found]
+            found.append((record.name, values))
+    # Hidden before YAML folds long lines.
+    return [(name, _yaml(case.hide(values))) for name, values in found]
 
 
 def versions(case: Case) -> list[tuple[str, str]]:
