@@ -90,7 +90,7 @@ def resolve_chain(
     unless that was read with other settings than this run's.
 
     Args:
-        asked: stages for which this very request has settings.
+        asked: settings that this very request gives, such as ``views.masks``.
 
     Raises:
         RequestError: an unknown stage, or one named twice.
@@ -118,7 +118,7 @@ def resolve_chain(
         names = (*names[:after], *prepared, *names[after:])
         implicit += prepared
     elif not stages and not from_stage:
-        kept = {n for n in readers if n not in asked and _read_as_set(n, config, store)}
+        kept = {n for n in readers if _read_as_set(n, config, store, asked)}
         names = tuple(n for n in names if n not in kept)
     first = next((name for name in names if name not in implicit), names[0])
     position = order.index(first) if first in order else len(order)
@@ -127,13 +127,18 @@ def resolve_chain(
     return Chain(names, upstream, implicit, standing)
 
 
-def _read_as_set(name: str, config: Config, store: Store) -> bool:
-    """Has a stage a result in use that was made with these settings, as far as it knew them?"""
+def _read_as_set(name: str, config: Config, store: Store, asked: Collection[str]) -> bool:
+    """Has a stage a result in use that was made with these settings, as far as it knew them?
+
+    Of files that settings name it knows no path: one that is asked for counts as another.
+    """
     result = store.current(name)
     if result is None:
         return False
     before, now = result.manifest["key_material"]["config"], result_fields(config.sections[name])
-    return all(before[field] == now[field] for field in before.keys() & now.keys())
+    others = {setting.split(".")[1] for setting in asked if setting.startswith(f"{name}.")}
+    same = all(before[field] == now[field] for field in before.keys() & now.keys())
+    return same and others <= before.keys()
 
 
 def _prepares(name: str, names: Sequence[str], usable: Mapping[str, Stage]) -> bool:

@@ -133,7 +133,8 @@ class Runner:
         """Warn where results taken as they are do not fit together, or what was asked for."""
         contents: dict[str, str] = {}
         for name in self.chain.upstream:
-            if name in self.request.asked and self.store.current(name) is not None:
+            given = any(setting.startswith(f"{name}.") for setting in self.request.asked)
+            if given and self.store.current(name) is not None:
                 self.reporter.message(
                     f"The settings given for '{name}' change nothing in this run: its result in "
                     f"use is taken as it is. Run with --from {name} to have it made with them."

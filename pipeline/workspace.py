@@ -43,9 +43,9 @@ class Request:
 
     @property
     def asked(self) -> frozenset[str]:
-        """Stages (and `run`) for which the user gave settings this time."""
+        """Settings that the user gave this time, such as ``views.masks``."""
         before = {change.removeprefix("--set ") for change in self.taken_over}
-        return frozenset(c.partition(".")[0].strip() for c in self.overrides if c not in before)
+        return frozenset(c.partition("=")[0].strip() for c in self.overrides if c not in before)
 
     def save(self) -> None:
         """Remember the request in the workspace, for `status` and for runs that name no images."""

@@ -319,6 +319,7 @@ def test_photographs_are_read_again_with_other_settings(run: Any) -> None:
     run()
     assert "read" not in run(images=())
     assert run("read.keep=1", images=())["read"] == "ran"
+    assert "read" not in run("read.keep=1", images=()), "what is there is what is asked for"
     assert run("scale.factor=5", images=())["read"] == "cached"  # the preset's setting again
 
 
