@@ -30,6 +30,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples and tests
+
 from data_samples.mouths.cameras import Camera as TrueCamera
 from data_samples.mouths.mouth import build_mouth
 from data_samples.mouths.moves import Move

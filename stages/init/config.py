@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from pipeline.artifacts.dental.fdi import ALL_TEETH, THE_NUMBERS
@@ -274,6 +274,14 @@ class LengthConfig(StageConfig):
         (0, 0), description="where it begins, x and y in pixels of that photograph (upright)"
     )
     end: tuple[float, float] = Field((0, 0), description="where it ends")
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.mm is not None and (not self.photo or self.start == self.end):
+            raise PydanticCustomError(
+                "length", "it needs init.length.photo, init.length.start and init.length.end too"
+            )
+        return self
 
 
 class InitConfig(StageConfig):

@@ -235,6 +235,8 @@ def _from_features(context: StageContext, views: Views) -> None:
             told.append(f"The teeth do not place more of the photographs: {doubtful}")
     for text in told:
         context.warn(text)
+    if config.dental.order is not None:
+        context.warn("init.dental.order was not used: texture places these photographs, not teeth.")
     dense.densify(context, views, placement.normalised())
 
 

@@ -217,3 +217,9 @@ def test_the_command_line_says_so_in_one_paragraph(
         assert stop.value.code == 2, (arguments, said)
         assert word in said.replace("\n", " ") and "Traceback" not in said
     assert pipeline.__name__
+
+
+@pytest.mark.parametrize("more", [(), ("init.length.photo=front.jpg",)])
+def test_a_length_that_begins_and_ends_nowhere_is_refused_at_once(more: tuple[str, ...]) -> None:
+    with pytest.raises(RequestError, match=r"needs init\.length\.photo, init\.length\.start"):
+        load_config(None, ("init.length.mm=8.6", *more))
