@@ -69,7 +69,7 @@ def ball_page() -> str:
     knowledge = Knowledge(
         scale=MM, teeth=[tooth(11, -0.2, -0.2), tooth(41, -0.1, 0.3)],
         measurements=[
-            measurement(),
+            measurement(value=-2.5),
             measurement(name="hidden", title="Overbite", value=None, uncertainty=None,
                         points=None, not_visible="the upper teeth cover the edges"),
             measurement(name="overbite", title="Overbite", value=3.1, uncertainty=2.2,
@@ -151,6 +151,11 @@ MEASURE = """(async () => {
   page.render();
   result.estimate = [...document.querySelectorAll("#drawing .said")].at(-1).textContent;
   estimate.click();
+  const overjet = document.querySelector("#measured [data-measure=overjet]");
+  overjet.click();
+  page.render();
+  result.behind = [...document.querySelectorAll("#drawing .said")].at(-1).textContent;
+  overjet.click();
 
   const whole = colours();
   press("u");
@@ -222,7 +227,8 @@ def test_measuring_and_overlays(tmp_path: Path) -> None:
     assert found["beside"] == "There is no surface at this point."
     assert found["tool"] == "turn"
     assert [text.split()[0] for text in found["marks"]] == ["Distance", "Angle"]
-    assert found["table"][0] == "Overjet2.5 ± 0.4 mmsure"
+    assert found["table"][0] == "Overjet-2.5 ± 0.4 mmsure"
+    assert found["behind"] == "Overjet -2.5 ± 0.4 mm", "lower teeth in front"
     assert found["table"][1] == "Overbitenot visible: the upper teeth cover the edges"
     assert found["table"][2] == (
         "Overbite3.1 ± 2.2 mmestimated, 38 ± 17 % of the crowns covered; unsure"
@@ -258,6 +264,7 @@ LINKS = """(async () => {
   result.focus = document.activeElement === field;
   field.value = UNTRUE;
   field.dispatchEvent(new Event("change"));
+  result.stays = [field.isConnected, document.activeElement === field, field.value === UNTRUE];
   press("u"); press("v"); press("x"); press("]");
   for (let k = 0; k < 5; k++) press("ArrowLeft");
   page.render();
@@ -323,6 +330,7 @@ def test_links_bring_back_what_was_seen_and_nothing_else(tmp_path: Path) -> None
     assert (found["errors"], log) == ("", [])
     assert found["opened"] == ["both", "universal", 0]
     assert found["focus"], "the note can be written at once"
+    assert found["stays"] == [True, True, True], "a note that is written keeps what has the focus"
     assert found["note"].startswith("2: <img src=x"), "text stays text"
     assert found["images"] == 0
     assert len(found["link"]) < 1500

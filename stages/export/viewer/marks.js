@@ -108,7 +108,7 @@ class Marks {
     this.#line(ends);
     ends.forEach((end) => this.#dot(end));
     const { scale } = this.viewer.scene;
-    const text = lengthText(Math.abs(entry.value), entry.uncertainty, scale);
+    const text = measuredText(entry, scale);
     if (ends[0] && ends[1]) {
       const middle = [(ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2];
       this.#label(middle, `${entry.title}${entry.estimated ? ", estimated:" : ""} ${text}`);

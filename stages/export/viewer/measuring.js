@@ -46,6 +46,12 @@ function lengthText(value, off, scale) {
   return `${value.toFixed(1)} ± ${Math.max(off, 0.1).toFixed(1)} mm${unsaid}`;
 }
 
+/** What was measured by itself, for people: overjet and overbite have a sign, the others a side. */
+function measuredText(entry, scale) {
+  const signed = entry.name === "overjet" || entry.name === "overbite";
+  return lengthText(signed ? entry.value : Math.abs(entry.value), entry.uncertainty, scale);
+}
+
 /** That a value is no measurement, and what else is known of it; empty where it is one. */
 function estimateText({ estimated }) {
   if (!estimated) return "";

@@ -1,6 +1,18 @@
 // The panel with the tools: shows the state, and changes it.
 
-function listMarks(tools, now) {
+/** Are these the same marks, but for what is written in their notes? */
+function onlyTexts(now, before) {
+  return now.length === before?.length && now.every((mark, index) =>
+    Object.keys(mark).every((key) => key === "text" || mark[key] === before[index][key]));
+}
+
+/** List the marks; where only notes were written, what has the focus or is being clicked stays. */
+function listMarks(tools, now, before) {
+  if (onlyTexts(now.marks, before?.marks)) {
+    const notes = now.marks.filter(({ kind }) => kind === "note");
+    byId("marks").querySelectorAll("input").forEach((field, k) => { field.value = notes[k].text; });
+    return;
+  }
   const { scene } = tools.viewer;
   const items = now.marks.map((mark, index) => {
     const item = document.createElement("li");
@@ -61,9 +73,7 @@ function measurementRow(tools, entry) {
       { measure: tools.store.now.measure === entry.name ? null : entry.name }));
     name.append(show);
     const text = document.createElement("span");
-    const signed = entry.name === "overjet" || entry.name === "overbite";
-    const shown = signed ? entry.value : Math.abs(entry.value);
-    text.textContent = lengthText(shown, entry.uncertainty, scene.scale);
+    text.textContent = measuredText(entry, scene.scale);
     const small = document.createElement("small");
     small.textContent = [estimateText(entry), entry.direction, entry.sure]
       .filter(Boolean).join("; ");
@@ -113,7 +123,7 @@ function addPanel(viewer, tools) {
       button.setAttribute("aria-pressed", button.dataset.measure === now.measure);
     }
     viewer.canvas.classList.toggle("aiming", now.tool !== "turn");
-    if (now.marks !== before?.marks) listMarks(tools, now);
+    if (now.marks !== before?.marks) listMarks(tools, now, before);
   };
   store.listeners.push(update);
   update(store.now);

@@ -142,7 +142,8 @@ class Viewer extends Screen {
 
   #layPhoto(pose) {
     const photo = byId("photo");
-    const alone = this.view >= 0 && !this.motion && !this.store.now.sides;
+    const shown = this.scene.views[this.view]?.photo;
+    const alone = shown && !this.motion && !this.store.now.sides;
     const share = alone ? Number(byId("opacity").value) / 100 : 0;
     photo.style.opacity = share;
     if (!pose.frame || share === 0) return;
