@@ -29,7 +29,7 @@ from stages.export.mesh.solid import (
     is_closed,
     well_composed,
 )
-from stages.export.mesh.surface import Mesh
+from stages.export.mesh.surface import Mesh, face_normals, repair, turned_faces
 from stages.export.mesh.texture.atlas import packed, textured
 from stages.export.mesh.texture.glb import write_glb
 from stages.export.mesh.texture.levelling import levelled
@@ -340,3 +340,19 @@ def test_without_a_scale_no_model_is_made_and_why_is_said(tmp_path: Path) -> Non
     assert not any(name.endswith(".glb") or name.startswith("model") for name in names)
     description = json.loads((tmp_path / "exports" / "scene.json").read_text())
     assert "model" in description["skipped"]
+
+
+def test_a_repaired_surface_has_two_sides() -> None:
+    """Some faces look inward, as closed holes and simplification leave them."""
+    flat = sheet(20, 20, lambda u, v: (u, v, 0 * u), lambda u, v: (u, v, 0 * u))
+    faces = flat.faces.copy()
+    inward = np.array([70, 71, 200, 301])
+    faces[inward] = faces[inward][:, ::-1]
+    spoilt = replace(flat, faces=faces)
+    assert (np.flatnonzero(turned_faces(spoilt)) == inward).all()
+    mended = repair(spoilt, 10_000, 30)
+    assert not turned_faces(mended).any()
+    normals = face_normals(mended)
+    assert (normals[:, 2] * face_normals(flat)[0, 2] > 0).all()
+    area = np.linalg.norm(normals, axis=1).sum() / 2
+    assert area == pytest.approx(np.linalg.norm(face_normals(flat), axis=1).sum() / 2)

@@ -130,7 +130,8 @@ def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
     """Repair a mesh and simplify it to at most about `target_faces` (quadric edge collapse).
 
     Removes duplicate and null faces and non-manifold edges and vertices, and closes holes of up to
-    `largest_hole` edges. Colours are taken over from the nearest original vertices.
+    `largest_hole` edges (0: none, and faces stay turned as they are). Colours are taken over from
+    the nearest original vertices.
     """
     import pymeshlab
 
@@ -153,6 +154,8 @@ def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
             preservenormal=True, preservetopology=True, planarquadric=True, qualitythr=0.5,
         )  # fmt: skip
         _make_manifold(work)
+    if largest_hole:
+        _turn_one_way(work, largest_hole)
     work.meshing_remove_unreferenced_vertices()
     result = work.current_mesh()
     vertices = np.array(result.vertex_matrix(), np.float64)
@@ -163,6 +166,39 @@ def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
 def _make_manifold(work):  # type: ignore[no-untyped-def]  # pymeshlab has no types
     work.meshing_repair_non_manifold_edges()
     work.meshing_repair_non_manifold_vertices()
+
+
+def _turn_one_way(work, largest_hole):  # type: ignore[no-untyped-def]
+    """Put others in the place of faces that look inward where their neighbours look outward.
+
+    Closing holes and simplifying leave some, slivers mostly, and with them a surface has no sides.
+    """
+    import pymeshlab
+
+    for last in (False, False, True):
+        now = work.current_mesh()
+        vertices, faces = np.array(now.vertex_matrix()), np.array(now.face_matrix())
+        wrong = turned_faces(Mesh(vertices, faces, vertices))
+        if not wrong.any():
+            return
+        work.add_mesh(pymeshlab.Mesh(vertices, faces[~wrong]))
+        _make_manifold(work)
+        if not last:
+            work.meshing_close_holes(maxholesize=largest_hole, newfaceselected=False)
+
+
+def turned_faces(mesh: Mesh) -> npt.NDArray[np.bool_]:
+    """[F] bool: of two faces that pass their common edge in the same direction, the one that looks
+    less where the surface does (weighted by area: a sliver hardly looks anywhere)."""
+    faces = mesh.faces.astype(np.int64)
+    edges = faces.ravel() * len(mesh.vertices) + faces[:, [1, 2, 0]].ravel()
+    order = np.argsort(edges, kind="stable")
+    twice = np.flatnonzero(edges[order][1:] == edges[order][:-1])
+    pairs = np.stack([order[twice], order[twice + 1]], 1) // 3
+    agrees = (face_normals(mesh) * vertex_normals(mesh)[faces].sum(1)).sum(1)
+    wrong = np.zeros(len(faces), bool)
+    wrong[np.where(agrees[pairs[:, 0]] < agrees[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
+    return wrong
 
 
 def _transfer_colors(source: Mesh, vertices: Array) -> Array:
