@@ -91,7 +91,7 @@ def _agreed(
         return None
     teeth = agreed_numbers(read, placed, cameras.cameras, depths)
     seen, by_name = {view.name for view in placed}, views.by_name()
-    by_name |= {v.name: v for v in placed if _turned_over(v, by_name[v.name])}
+    by_name |= {v.name: v for v in placed if v.turned_over}
     drawn = {
         dentition.name: labelled_overlay(by_name[dentition.name].image, dentition)
         for dentition in teeth.chosen if dentition.name in seen
@@ -128,14 +128,9 @@ def _differs(view: View, before: View) -> bool:
     return not same or view.focal_px != before.focal_px
 
 
-def _turned_over(view: View, before: View) -> bool:
-    sides = [np.linalg.det(v.working_from_source[:2, :2]) > 0 for v in (view, before)]
-    return bool(sides[0] != sides[1])
-
-
 def place_in(placed: View, view: View, pixel: Place) -> Place:
     """A pixel of a photograph as it was taken, in the picture that its camera belongs to."""
-    if _turned_over(placed, view):
+    if placed.turned_over:
         pixel = np.array([view.width - pixel[0], pixel[1]])
     if placed.lens_taken_out == view.lens_taken_out:
         return pixel

@@ -135,6 +135,7 @@ MEASURE = """(async () => {
   result.angle = said();
   click(1, 1);
   result.beside = said();
+  result.told = !$("told").hidden && $("told").textContent;
   press("Escape");
   result.tool = page.state.tool;
   result.marks = [...document.querySelectorAll("#marks li > span")].map((s) => s.textContent);
@@ -224,7 +225,7 @@ def test_measuring_and_overlays(tmp_path: Path) -> None:
     a, b = places[0] - places[1], places[2] - places[1]
     angle = np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
     assert float(found["angle"].split("°")[0]) == pytest.approx(angle, abs=2)
-    assert found["beside"] == "There is no surface at this point."
+    assert found["beside"] == found["told"] == "There is no surface at this point."
     assert found["tool"] == "turn"
     assert [text.split()[0] for text in found["marks"]] == ["Distance", "Angle"]
     assert found["table"][0] == "Overjet-2.5 ± 0.4 mmsure"
@@ -281,6 +282,12 @@ LINKS = """(async () => {
   await go("");
   await go(link);
   const after = page.pixels();
+  press("j"); press("o");
+  await go(`${link}&`);
+  result.asTheLink = [page.state.jaw, page.state.mesh, page.state.marks.length];
+  press("m"); press("h"); press("Escape");
+  result.helpFirst = [$("help").hidden, page.state.tool];
+  press("Escape");
   result.same = state === JSON.stringify(page.state.marks.map(({ kind, text }) => [kind, text]));
   result.shown = [page.state.support, page.state.axis, page.state.at, page.state.numbers];
   result.picture = before.reduce((sum, v, k) => sum + Math.abs(v - after[k]), 0) / before.length;
@@ -330,6 +337,8 @@ def test_links_bring_back_what_was_seen_and_nothing_else(tmp_path: Path) -> None
     assert (found["errors"], log) == ("", [])
     assert found["opened"] == ["both", "universal", 0]
     assert found["focus"], "the note can be written at once"
+    assert found["asTheLink"] == ["both", False, 2], "nothing stays of what was shown before"
+    assert found["helpFirst"] == [True, "distance"]
     assert found["stays"] == [True, True, True], "a note that is written keeps what has the focus"
     assert found["note"].startswith("2: <img src=x"), "text stays text"
     assert found["images"] == 0

@@ -165,6 +165,11 @@ PROBE = """
   press("2"); press("1");
   deed("Number the row").click();
   result.renumbered = row(1);
+  chip(1, "13").click();
+  press("2"); press("8");
+  deed("Number the row").click();
+  result.beyond = row(1);
+  press("z", { ctrlKey: true }); press("z", { ctrlKey: true });
   chip(1, "42").click();
   press("s"); press("ArrowRight"); press("Enter");
   result.splitByKeys = row(1).slice(7);
@@ -216,6 +221,7 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path, corner: tuple[
     assert " ".join(result["afterRemoval"]) == "53 12 11 21 22 23 43 42 31 32 33"
     assert result["split"][:7] == ["13", "12", "11", "?", "?", "22", "23"]
     assert result["renumbered"][:7] == ["13", "12", "11", "21", "22", "23", "24"]
+    assert result["beyond"] == ["28", *result["renumbered"][1:]], "no teeth of other quadrants"
     assert result["splitByKeys"] == ["43", "?", "?", "41", "31", "32", "33"]
     assert result["overflow"] == 0 and result["requests"] == []
     assert result["download"] == "teeth.yaml"

@@ -41,7 +41,7 @@ const say = (text, bad = false) => {
 const change = (deed) => {
   past.push({ state: photos.map((photo) => changing.map((name) => photo[name])), chosen });
   deed();
-  cut = null;
+  [cut, typed] = [null, ""];
   find("next").hidden = true;
   draw();
 };
@@ -49,7 +49,7 @@ const undo = () => {
   const before = past.pop();
   if (!before) return;
   photos.forEach((photo, k) => changing.forEach((name, n) => { photo[name] = before.state[k][n]; }));
-  [chosen, cut] = [before.chosen, null];
+  [chosen, cut, typed] = [before.chosen, null, ""];
   say("Undone.");
   draw();
 };

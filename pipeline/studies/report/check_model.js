@@ -18,7 +18,9 @@ const standing = (tooth) => {
   const place = tooth % 10;
   return [1, 4].includes(quadrantOf(tooth)) ? -place : place;
 };
+// The tooth there; 0 beyond the last one of the jaw.
 const numberAt = (jaw, stand, primary) => {
+  if (Math.abs(stand) > (primary ? 5 : 8)) return 0;
   const quadrant = jaw === "upper" ? (stand < 0 ? 1 : 2) : (stand < 0 ? 4 : 3);
   return (quadrant + (primary ? 4 : 0)) * 10 + Math.abs(stand);
 };

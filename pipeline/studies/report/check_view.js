@@ -47,6 +47,9 @@ const cardOf = (photo) => {
     dragged = true;
     finishCut();
   });
+  card.svg.addEventListener("pointercancel", () => {
+    if (cut) cut.dragged = false;
+  });
   card.svg.addEventListener("click", (event) => {
     if (cut || dragged) return;
     const hit = event.target.closest(".crown");

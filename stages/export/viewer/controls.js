@@ -80,7 +80,7 @@ function keysOf(viewer, tools) {
     "[": () => cut(-0.05), "]": () => cut(0.05),
     o: toggle("mesh"), v: toggle("support"), d: toggle("sides"), l: () => tools.copyLink(),
     Backspace: () => tools.removeLast(), Delete: () => tools.removeLast(),
-    Escape: () => tools.back() || showHelp(false),
+    Escape: () => (byId("help").hidden ? tools.back() : showHelp(false)),
   };
 }
 

@@ -24,7 +24,9 @@ function readAddress(viewer, tools) {
   byId("bar").hidden = byId("label").hidden = wanted.has("bare");
   const { views, orbiting } = viewer.scene;
   const { state, camera } = readLink(hash, orbiting, views.length);
-  if (Object.keys(state).length) tools.show(tools.possible(state));
+  // a link with a camera is of the whole page: what it does not name is as at first
+  const whole = camera ? { ...new Store().now, ...state } : state;
+  if (Object.keys(whole).length) tools.show(tools.possible(whole));
   if (camera) {
     viewer.stand(camera);
     return true;

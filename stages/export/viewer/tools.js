@@ -27,6 +27,15 @@ class Tools {
     byId("live").textContent = text;
   }
 
+  /** Say it to everybody: what was asked for could not be done, or nothing else shows that it was. */
+  tell(text) {
+    this.say(text);
+    byId("told").textContent = text;
+    byId("told").hidden = false;
+    clearTimeout(this.telling);
+    this.telling = setTimeout(() => { byId("told").hidden = true; }, 5000);
+  }
+
   /** Can the scene show this at all? */
   has(key) {
     const { scene, splats } = this.viewer;
@@ -45,7 +54,7 @@ class Tools {
     const possible = this.possible(changes);
     const [key] = Object.keys(changes);
     if (!Object.keys(possible).length) {
-      this.say("This scene does not have that.");
+      this.tell("This scene does not have that.");
       return;
     }
     if (changes.sides) this.#turnAside();
@@ -92,11 +101,12 @@ class Tools {
   }
 
   open(shown) {
+    const inside = byId("tools").contains(document.activeElement);
     byId("tools").hidden = !shown;
     byId("more").setAttribute("aria-expanded", shown);
     document.body.classList.toggle("tools-open", shown);
     if (shown) byId("tools").querySelector("button").focus();
-    else if (document.activeElement === document.body) byId("more").focus();
+    else if (inside || document.activeElement === document.body) byId("more").focus();
     this.viewer.wake(false);
   }
 
@@ -117,14 +127,14 @@ class Tools {
     const { tool, pending, marks } = this.store.now;
     if (tool === "turn") return;
     if (marks.length >= MOST_MARKS) {
-      this.say("That is as many marks as the page can hold.");
+      this.tell("That is as many marks as the page can hold.");
       return;
     }
     const spot = this.viewer.paneAt(x, y);
     const { splats, scene } = this.viewer;
     const place = pick(splats, scene.format, spot.pose, spot.x, spot.y, this.viewer.shownParts());
     if (!place) {
-      this.say("There is no surface at this point.");
+      this.tell("There is no surface at this point.");
       return;
     }
     const places = [...pending, place];
@@ -184,12 +194,12 @@ class Tools {
   async copyLink() {
     const link = this.link();
     history.replaceState(null, "", link);
-    const short = link.length <= LONGEST_LINK;
+    const warning = link.length <= LONGEST_LINK ? "" : " It is too long to be read again.";
     try {
       await navigator.clipboard.writeText(location.href);
-      this.say(short ? "Link copied." : "Link copied, but it is too long to be read again.");
+      this.tell(`Link copied.${warning}`);
     } catch {
-      this.say("The link is in the address bar; copy it from there.");
+      this.tell(`The link is in the address bar; copy it from there.${warning}`);
     }
   }
 }

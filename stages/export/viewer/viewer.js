@@ -200,9 +200,9 @@ class Viewer extends Screen {
     Object.assign(this.camera, { rotation, target, distance });
     const home = this.scene.views[lens];
     const pose = this.camera.pose();
-    const off = Math.hypot(...minus(pose.translation, home.translation))
-      + Math.hypot(...pose.rotation.map((value, k) => value - home.rotation[k]));
-    if (off > 1e-3 * this.scene.orbiting.radius) this.leave();
+    const shift = Math.hypot(...minus(pose.translation, home.translation));
+    const turn = Math.hypot(...pose.rotation.map((value, k) => value - home.rotation[k]));
+    if (shift > 1e-3 * this.scene.orbiting.radius || turn > 1e-3) this.leave();
   }
 
   nearestView() {
