@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import cv2
 import numpy as np
 import pytest
 
@@ -54,6 +55,22 @@ def test_teeth_are_covered_and_gloves_and_the_dark_are_not() -> None:
         assert not shown[kind == GLOVE].any()
         assert shown[kind == 0].mean() < 0.01
         assert view.depth.dtype == view.normal.dtype == view.confidence.dtype == np.float32
+
+
+def test_gum_that_is_seen_in_stripes_leaves_no_fringes() -> None:
+    images, valid, dentitions, fit, truth = inputs()
+    stripes = np.arange(images[0].shape[1]) % 24 < 5
+    usable = [
+        mask & ((kind != GUM) | stripes) for mask, (_, _, kind) in zip(valid, truth, strict=True)
+    ]
+    options = SurfaceOptions(rounds=())
+    fringed = dense_surface(images, usable, dentitions, fit, options)
+    for view, (_, _, kind) in zip(fringed.views, truth, strict=True):
+        assert view is not None
+        gum = (cv2.distanceTransform(np.uint8(kind != TOOTH), cv2.DIST_L2, 5) > 8) & (kind == GUM)
+        assert (gum & stripes).sum() > 100
+        assert (view.depth[gum & stripes] > 0).mean() < 0.02
+        assert (view.depth[kind == TOOTH] > 0).mean() > 0.95
 
 
 def test_gum_is_shown_only_up_to_its_height() -> None:

@@ -36,7 +36,7 @@ from stages.init.dental.surface.colour import (
 )
 from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.dental.surface.photos.tissue import without_small_holes
+from stages.init.dental.surface.photos.tissue import without_fringes, without_small_holes
 from stages.init.dental.surface.sweep import choose_pairs, matching_cost
 from tests.stages.dental_surface_case import photo, row_of_teeth
 
@@ -267,6 +267,19 @@ def test_highlights_and_shade_between_crowns_are_no_holes() -> None:
     filled = without_small_holes(mask, 4.0)
     assert filled[40:60, 60:80].all() and filled[100:103, 100:150].all()
     assert (filled != expected).mean() < 0.002  # but for corners
+
+
+def test_a_rim_has_no_fringes_and_no_slits() -> None:
+    expected = np.zeros((200, 300), bool)
+    expected[:100] = True  # at four samples per mm
+    ragged = expected.copy()
+    ragged[100:120, 30:34] = ragged[100:120, 280:283] = True
+    ragged[60:100, 150:155] = False
+    even = without_fringes(ragged, 4.0)
+    assert (ragged != expected).sum() > 300
+    assert (even != expected).sum() < 50  # but for corners
+    np.testing.assert_array_equal(without_fringes(expected, 4.0), expected)
+    assert not without_fringes(np.zeros_like(expected), 4.0).any()
 
 
 def test_gains_undo_exposures() -> None:

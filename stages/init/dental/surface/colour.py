@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from pipeline.artifacts.dental.fdi import Jaw
 from stages.init.dental.surface.photos.photo import Photo
-from stages.init.dental.surface.photos.tissue import disc
+from stages.init.dental.surface.photos.tissue import disc, without_fringes
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
@@ -28,8 +28,6 @@ _GLOW = 0.4
 _LEAST_TISSUE = 0.5
 #: Votes (squared cosines) below this are none.
 _LEAST_VOTE = 0.02
-#: Fringes and gaps narrower than twice this (mm) are cleaned off the rim.
-_RAGGED = 0.8
 #: Smaller pieces (square mm) are left out: half of what the smallest crown shows.
 _CRUMB = 10.0
 #: The gum's rim is made even over this length of the arch (mm).
@@ -114,10 +112,7 @@ def find_tissue(
     known = total > _LEAST_VOTE
     share = (tooth + gum) / np.maximum(total, np.float32(1e-6))
     toothy = (tooth / np.maximum(total, np.float32(1e-6))).astype(np.float32)
-    narrow = disc(_RAGGED * density)
-    rough = (known & (share > _LEAST_TISSUE)).astype(np.uint8)
-    closed = cv2.morphologyEx(rough, cv2.MORPH_CLOSE, narrow)
-    kept = np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, narrow)) > 0
+    kept = without_fringes(known & (share > _LEAST_TISSUE), density)
     return _with_teeth(kept, known & (toothy > _LEAST_TISSUE), density), toothy
 
 
@@ -153,9 +148,8 @@ def even_rim(kept: Mask, tooth: Mask, beyond_gum: Array32, density: float) -> Ma
     size = int(_EVEN * density) | 1
     least = ndimage.minimum_filter1d(furthest, size, mode="nearest")
     line = ndimage.gaussian_filter1d(least, size / 4, mode="nearest")
-    even = (kept & (tooth | (beyond_gum <= line[None]))).astype(np.uint8)
-    opened = np.asarray(cv2.morphologyEx(even, cv2.MORPH_OPEN, disc(_RAGGED * density))) > 0
-    return _with_teeth(opened, tooth & kept, density)
+    even = kept & without_fringes(kept & (tooth | (beyond_gum <= line[None])), density)
+    return _with_teeth(even, tooth & kept, density)
 
 
 def photo_weights(

@@ -42,7 +42,7 @@ from stages.init.dental.surface.grow import grow_gum
 from stages.init.dental.surface.measured import bend_to
 from stages.init.dental.surface.options import OUTLINE_ERROR, SurfaceOptions, SweepRound
 from stages.init.dental.surface.photos.photo import FullSize, Photo, at_full_size, prepare_photo
-from stages.init.dental.surface.photos.tissue import joined_to
+from stages.init.dental.surface.photos.tissue import joined_to, without_fringes
 from stages.init.dental.surface.sweep import choose_pairs, sweep
 
 Array32 = npt.NDArray[np.float32]
@@ -385,6 +385,9 @@ def _look(
         depth = np.where(better, z, depth)
         normal = np.where(better[..., None], turned, normal)
         agreement = np.where(better, agreed, agreement)
-    depth *= joined_to(depth > 0, (photo.upper > 0) | (photo.lower > 0))  # no crumbs of gum
+    tooth = (photo.upper > 0) | (photo.lower > 0)
+    depth *= tooth | without_fringes(depth > 0, photo.density)
+    depth *= joined_to(depth > 0, tooth)  # no crumbs of gum
     confidence = np.where(depth > 0, confidence_of(agreement, options.guess), 1).astype(np.float32)
+    normal *= (depth > 0)[..., None]
     return SurfaceView(depth, normal.astype(np.float32), confidence)

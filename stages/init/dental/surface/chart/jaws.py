@@ -23,7 +23,7 @@ from stages.init.dental.surface.chart.grid import ChartGrid, grid_around, normal
 from stages.init.dental.surface.chart.raster import nearest_of, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photos.photo import Photo
-from stages.init.dental.surface.photos.tissue import disc
+from stages.init.dental.surface.photos.tissue import disc, without_fringes
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -199,7 +199,7 @@ def clearly_seen(
 
     Where another photograph faces the row better and yet does not show it, because it ends there or
     a lip is before it, the angle must be better: what is left beyond is drawn out, and in crumbs.
-    Pieces too small for a tooth and its gum are left out.
+    The rim is even, and pieces too small for a tooth and its gum are left out.
     """
     points = chart.points
     normals = smooth_normals(chart.radius, chart.grid, _ROW_SMOOTHING)
@@ -211,6 +211,7 @@ def clearly_seen(
         shown = photo.sample(free.astype(np.float32), photo.project(points)[0]) > 0.5
         least = np.where(first, options.least_showing, options.least_beside)
         clear |= shown & (cosine > least) & sees(photo, front, points, 2 * HIDDEN)
+    clear = without_fringes(clear, chart.grid.density)
     used = chart.used(PAST_EDGE, options.gum_height)
     return clear & ~_scraps(clear & used, chart.grid.density)
 

@@ -10,7 +10,7 @@ Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 #: Notches narrower than twice this (mm), and enclosed holes up to this size (square mm), in what is
-#: tooth or gum are wet highlights, or the shade between crowns.
+#: tooth or gum are wet highlights, or the shade between crowns; fringes so narrow are neither.
 _NOTCH, _HOLE = 1.0, 30.0
 #: Darker than so much of the median of the teeth, over at least so many mm: nothing is there that a
 #: light beside the lens could reach.
@@ -69,6 +69,13 @@ def without_small_holes(mask: Mask, density: float) -> Mask:
     hole = enclosed & (stats[:, 4] <= _HOLE * density**2)
     hole[0] = False
     return (closed > 0) | hole[label]
+
+
+def without_fringes(mask: Mask, density: float) -> Mask:
+    """A mask [H, W] bool, so many samples per mm, without the fringes and notches of its rim."""
+    narrow = disc(_NOTCH * density)
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, narrow)
+    return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, narrow) > 0)
 
 
 def find_void(lightness: Array32, tooth: Mask, density: float) -> Mask:
