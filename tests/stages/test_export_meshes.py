@@ -29,7 +29,7 @@ from stages.export.mesh.solid import (
     is_closed,
     well_composed,
 )
-from stages.export.mesh.surface import Mesh, face_normals, repair, turned_faces
+from stages.export.mesh.surface import Mesh, face_normals, repair, turned_faces, vertex_normals
 from stages.export.mesh.texture.atlas import packed, textured
 from stages.export.mesh.texture.glb import write_glb
 from stages.export.mesh.texture.levelling import levelled
@@ -213,6 +213,34 @@ def test_a_closed_model_is_watertight_and_keeps_what_was_seen() -> None:
     open_model = replace(model, faces=model.faces[1:])
     assert not is_closed(open_model)
     assert not is_closed(replace(model, faces=model.faces[:, ::-1])), "inside out"
+
+
+def test_nothing_made_up_hides_what_was_seen_of_a_jaw() -> None:
+    """Below the other jaw's teeth a mesh goes on forward in a ledge, which looks down."""
+
+    def shape(u, v):  # type: ignore[no-untyped-def]
+        angle = np.pi * (0.15 + 0.7 * u)
+        radius = np.interp(v, [0, 0.5, 1], [14, 9, 9.6])
+        return (
+            radius * np.cos(angle),
+            np.interp(v, [0, 0.5, 1], [-0.5, 0, 7]),
+            radius * np.sin(angle),
+        )
+
+    mesh = sheet(90, 40, shape, lambda u, v: (u, v, v))
+    normals = vertex_normals(mesh)
+    if normals[1000] @ (mesh.vertices[1000] * [1, 0, 1]) < 0:
+        mesh, normals = replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy()), -normals
+    model = closed(mesh, height=3.0, depth=4.0, voxel=0.3)
+    assert model is not None and is_closed(model)
+    solid = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    wall = (mesh.vertices[:, 1] > 1) & ~border_vertices(mesh)
+    rays = np.concatenate([mesh.vertices[wall] + 0.5 * normals[wall], normals[wall]], 1)
+    seen = _Seen(model)
+    ahead = seen.scene.cast_rays(seen.tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    assert (ahead < 20).mean() < 0.02
+    assert model.vertices[:, 1].min() > mesh.vertices[:, 1].min() - 0.5
+    assert solid.body_count == 1
 
 
 def test_of_a_grid_what_is_near_a_surface_is_found_as_one_by_one() -> None:

@@ -150,9 +150,13 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
     seen = _Seen(mesh)
     border, distance, cosine = seen.around(grid, max(depth, EXACT * voxel))
     free = (cosine > 0) & ~border & (distance < FREE * depth)
-    free[:, int((high[1] - low[1]) / voxel) + 1 :] = False  # the base is whole
     shell = (distance < depth) & np.where(border, cosine < -BEHIND, cosine <= 0)
-    solid = np.logical_or.accumulate(shell, axis=1) & ~free
+    # nothing is nearer to the other jaw than what was seen, nor goes on in front of that
+    shell &= np.arange(grid.shape[1])[:, None] >= _tops(grid, mesh.vertices, depth)[:, None]
+    last = _last(shell)
+    solid = last > _last(free)
+    base = int((high[1] - low[1]) / voxel) + 1
+    solid[:, base:] = last[:, base:] >= 0  # the base is whole
     ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), THIN)
     skin = solid & ~border & (cosine <= 0) & (distance < THIN * voxel)
     solid = ndimage.binary_opening(solid, ball) | skin
@@ -175,6 +179,22 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
     on_surface = ~on_border & (away < SNAP * voxel) & (vertices[:, 1] < top - voxel)
     vertices = np.where(on_surface[:, None], there, vertices)
     return Mesh(vertices, faces, np.ones((len(vertices), 3)))
+
+
+def _last(marks: Bools) -> npt.NDArray[np.int16]:
+    """[X, Y, Z] the last layer along y, up to each point, in which its column has a mark; or -1."""
+    layers = np.arange(marks.shape[1], dtype=np.int16)[:, None]
+    return np.maximum.accumulate(np.where(marks, layers, np.int16(-1)), axis=1)
+
+
+def _tops(grid: _Grid, vertices: Array, reach: float) -> npt.NDArray[np.int64]:
+    """[X, Z] the first layer in which a vertex lies within `reach` to the sides."""
+    places = ((vertices - grid.low) / grid.voxel).astype(np.int64)
+    tops = np.full((grid.shape[0], grid.shape[2]), grid.shape[1])
+    np.minimum.at(tops, (places[:, 0], places[:, 2]), places[:, 1])
+    steps = np.arange(-int(reach / grid.voxel), int(reach / grid.voxel) + 1)
+    disc = steps[:, None] ** 2 + steps**2 <= (reach / grid.voxel) ** 2
+    return ndimage.minimum_filter(tops, footprint=disc, mode="nearest")
 
 
 def border_vertices(mesh: Mesh) -> Bools:
