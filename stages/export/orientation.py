@@ -6,8 +6,8 @@ direction for up are turned:
 - 3DGS `.ply`, compressed `.ply` and `.sog`: SuperSplat and PlayCanvas turn them by 180 degrees
   about z when they load them (`Transform.PLY` of @playcanvas/splat-transform), for scenes of 3DGS
   have y down.
-- `.stl`: slicers and CAD have z up and look along y. Slicers take a file as it lies, so a model of
-  the upper jaw (`model_upper.stl`) is turned further, onto its base.
+- `.stl`: slicers and CAD have z up and look along y. Slicers take a file as it lies, so the closed
+  models (`model_*.stl`) lie on their bases, in whatever frame the rest is.
 
 Lengths in `.glb` are metres, as glTF wants it, where a millimetre is known.
 
@@ -36,21 +36,27 @@ ON_ITS_BASE = np.diag([-1.0, 1.0, -1.0, 1.0]) @ Z_UP
 METRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
 
 
-def file_from_frame(name: str, stands: bool, millimetres: bool = False) -> Array:
+def file_from_frame(
+    name: str, stands: bool, millimetres: bool = False, to_mouth: Array | None = None
+) -> Array:
     """[4, 4] rotation (of `.glb`: scale) from the frame of the exports to that of a file.
 
     Args:
         name: of the file.
         stands: the frame has y up and z towards the viewer. Where it has not (that of given
-            cameras, our own world), all files are in it as it is.
+            cameras, our own world), all files but closed models are in it as it is.
         millimetres: that is the unit of the frame.
+        to_mouth: [4, 4] to the frame of the mouth, whose y the bases of closed models stand on;
+            None: not known, and there are no models.
     """
     if millimetres and name.endswith(".glb"):
         return METRES
     if stands and name.startswith("splats") and name.endswith((".ply", ".sog")):
         return VIEWERS_PLY
-    if stands and name == "model_upper.stl":
-        return ON_ITS_BASE
+    if to_mouth is not None and name.startswith("model_"):
+        turn = np.eye(4)
+        turn[:3, :3] = to_mouth[:3, :3]
+        return (ON_ITS_BASE if name == "model_upper.stl" else Z_UP) @ turn
     if stands and name.endswith(".stl"):
         return Z_UP
     return np.eye(4)

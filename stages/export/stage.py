@@ -16,7 +16,6 @@ from stages.export.config import ExportConfig
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.artifacts.cameras import Cameras
     from pipeline.artifacts.dental.fdi import Jaw
     from pipeline.artifacts.space.frames import Frame
     from pipeline.artifacts.space.scale import Scale
@@ -110,7 +109,7 @@ class ExportStage(Stage):
                 )  # fmt: skip
                 context.progress("mesh", 1, 1)
             finished = surface.give(
-                _finish_surface, context, cameras, scene, raw, mouth, teeth, folder, frame, scale,
+                _finish_surface, context, scene, raw, mouth, teeth, folder, frame, scale,
                 skipped,
             )  # fmt: skip
             frames = _write_video(context, scene, folder) if config.video else None
@@ -131,7 +130,7 @@ class ExportStage(Stage):
 
 
 def _finish_surface(
-    context: StageContext, cameras: Cameras, scene: Scene, raw: Mesh | None, mouth: Mouth | None,
+    context: StageContext, scene: Scene, raw: Mesh | None, mouth: Mouth | None,
     teeth: dict[str, Any] | None, folder: Path, frame: Frame, scale: Scale,
     skipped: dict[str, str],
 ) -> tuple[int | None, int]:  # fmt: skip
@@ -161,7 +160,7 @@ def _finish_surface(
         known = _knowledge(scene, frame, scale, mouth, teeth, mesh, jaws)
         page_bytes = _write_page(context, scene, folder, known)
     if mesh is not None:
-        _write_mesh(context, cameras, scene, mesh, seen, jaws, folder, frame, scale, skipped)
+        _write_mesh(context, scene, mesh, seen, jaws, folder, frame, scale, skipped)
     elif config.mesh:
         skipped["mesh"] = "too little surface for a mesh"
         context.warn(
@@ -174,7 +173,7 @@ def _finish_surface(
 
 
 def _write_mesh(
-    context: StageContext, cameras: Cameras, scene: Scene, mesh: Mesh, seen: Sequence[Sight],
+    context: StageContext, scene: Scene, mesh: Mesh, seen: Sequence[Sight],
     jaws: Mapping[Jaw, npt.NDArray[np.bool_]], folder: Path, frame: Frame, scale: Scale,
     skipped: dict[str, str],
 ) -> None:  # fmt: skip
@@ -191,9 +190,8 @@ def _write_mesh(
     write_meshes(writer, mesh, colored, jaws if config.mesh_jaws else {})
     if config.mesh_base:
         lacking = write_models(
-            writer, mesh, jaws, cameras.mouth_from_world, config.mesh_base_height,
-            config.mesh_base_depth, config.mesh_faces,
-        )  # fmt: skip
+            writer, mesh, jaws, config.mesh_base_height, config.mesh_base_depth, config.mesh_faces
+        )
         if lacking:
             skipped["model"] = lacking
             context.warn(

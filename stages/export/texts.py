@@ -60,8 +60,9 @@ with the reason.
 
 MODELS = """
 Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print: both lie
-on their bases, so they do not bite together as mesh_upper.stl and mesh_lower.stl do. Their outside
-is the mesh. The back and the base are made up, not measured: the photographs do not show them.
+on their bases (scene.json has the matrices), so they do not bite together as mesh_upper.stl and
+mesh_lower.stl do. Their outside is the mesh. The back and the base are made up, not measured: the
+photographs do not show them.
 """
 
 README = """\
@@ -112,8 +113,8 @@ FRAMES: dict[str, tuple[str, str, str]] = {
 }
 TURNED = """\
 Two kinds of files are turned against that frame, as their readers expect it: splats*.ply and
-splats.sog by 180 degrees about z, for SuperSplat, and .stl by 90 degrees about x, so that z is up
-(model_upper.stl further, onto its base). scene.json has the matrices.
+splats.sog by 180 degrees about z, for SuperSplat, and mesh*.stl by 90 degrees about x, so that z is
+up. scene.json has the matrices.
 """
 METRES = """\
 Lengths in .glb files are in metres, as their readers expect it; in all others in millimetres.
@@ -164,7 +165,9 @@ def scene_description(
             "file_from_frame": {
                 name: turn.tolist()
                 for name in sorted(files)
-                for turn in [file_from_frame(name, frame.stands, scale.unit == "mm")]
+                for turn in [
+                    file_from_frame(name, frame.stands, scale.unit == "mm", frame.to_mouth)
+                ]
                 if not np.array_equal(turn, np.eye(4))
             },
         },

@@ -305,12 +305,12 @@ def ball_teeth() -> Teeth:
     return Teeth(tuple(views))
 
 
-def export(folder: Path, scale: Scale, **settings: object) -> LocalContext:
+def export(folder: Path, scale: Scale, given: bool = False, **settings: object) -> LocalContext:
     case = scene.ball_case()
     case["teeth"] = ball_teeth()
     case["cameras"] = replace(
         case["cameras"], scale=scale, mouth_from_world=np.diag([1.0, -1, -1, 1]),
-        input_from_world=np.diag([6.0, 6, 6, 1]),
+        input_from_world=np.diag([6.0, 6, 6, 1]), given=given,
     )  # fmt: skip
     config = ExportConfig(
         mesh_faces=3000, mesh_resolution=64, mesh_views=2, video=False, viewer=False,
@@ -358,6 +358,25 @@ def test_the_stage_writes_each_jaw_and_models_of_both(tmp_path: Path) -> None:
     assert sum(len(part.faces) for part in parts.values()) == len(whole.faces)
     text = (home / "README.txt").read_text()
     assert "made up, not measured" in text and "metres" in text
+
+
+def test_models_lie_on_their_bases_in_the_frame_of_given_cameras(tmp_path: Path) -> None:
+    """That of these has y down; a printer prints a file as it lies."""
+    export(
+        tmp_path, Scale("mm", "cameras"), given=True, mesh_base=True, mesh_base_height=2.0,
+        mesh_base_depth=2.0, mesh_texture=0,
+    )  # fmt: skip
+    home = tmp_path / "exports"
+    frame = json.loads((home / "scene.json").read_text())["frame"]
+    assert frame["name"] == "input" and "mesh_upper.stl" not in frame["file_from_frame"]
+    for jaw in ("upper", "lower"):
+        part, model = (trimesh.load(home / f"{stem}_{jaw}.stl") for stem in ("mesh", "model"))
+        base = model.vertices[:, 2].min()
+        flat = (model.triangles_center[:, 2] < base + 0.05) & (model.face_normals[:, 2] < -0.99)
+        assert model.area_faces[flat].sum() > 0.2 * np.prod(model.extents[:2]), "it lies on it"
+        model.apply_transform(np.linalg.inv(frame["file_from_frame"][f"model_{jaw}.stl"]))
+        away, _ = cKDTree(model.vertices).query(part.vertices)
+        assert np.median(away) < 0.3, "no further than a voxel"
 
 
 def test_without_a_scale_no_model_is_made_and_why_is_said(tmp_path: Path) -> None:

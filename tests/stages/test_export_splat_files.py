@@ -146,6 +146,11 @@ def test_files_stand_as_their_readers_expect(folder: Path) -> None:
         np.testing.assert_allclose(turn @ turn.T, np.eye(3))
         assert np.linalg.det(turn) == pytest.approx(1), "turned, not mirrored"
         np.testing.assert_array_equal(file_from_frame(name, False), np.eye(4))
+    leans = np.array([[0, 1, 0, 5], [0, 0, 1, 6], [1, 0, 0, 7], [0, 0, 0, 1.0]])
+    for stands in (True, False):
+        turn = file_from_frame("model_upper.stl", stands, True, leans)
+        np.testing.assert_array_equal(turn @ [0, 0, 1, 0], [0, 0, -1, 0])  # up in the mouth
+        np.testing.assert_array_equal(turn[:3, 3], 0)
 
 
 def test_the_header_says_the_scale(folder: Path) -> None:

@@ -70,13 +70,17 @@ def test_a_picture_and_a_mesh(tmp_path: Path) -> None:
     assert picture.SOPInstanceUID != mesh.SOPInstanceUID
 
 
-def test_all_meshes_are_in_the_axes_of_a_patient(tmp_path: Path) -> None:
-    """In the frame of a mouth y is up; files have z up, and one of them lies on its base."""
+@pytest.mark.parametrize("frame", ["mouth", "input"])
+def test_all_meshes_are_in_the_same_axes(frame: str, tmp_path: Path) -> None:
+    """Those of a patient: in the frame of a mouth y is up; files have z up, and one of them lies on
+    its base. In the frame of given cameras, which has its own axes, that one alone is turned."""
     corners = np.array([[1, 2, 3], [5, 2, 3], [1, 9, 3]], np.float32)  # in the frame of the mouth
     turns = {
         "mesh.stl": [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
         "model_upper.stl": [[-1, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 1]],
     }
+    if frame == "input":
+        turns["mesh.stl"] = np.eye(4).tolist()
     folder = workspace(tmp_path / "w")
     for name, turn in turns.items():
         moved = corners @ np.array(turn, np.float32)[:3, :3].T
@@ -84,16 +88,21 @@ def test_all_meshes_are_in_the_axes_of_a_patient(tmp_path: Path) -> None:
         triangle["corners"] = moved
         data = stl(1)[:84] + triangle.tobytes()
         (folder / "results" / name).write_bytes(data)
-    scene = {"scale": IN_MM.as_dict(), "frame": {"name": "mouth", "file_from_frame": turns}}
+    told = {name: turn for name, turn in turns.items() if turn != np.eye(4).tolist()}
+    axes = {"name": frame, "axes": "those of the cameras", "file_from_frame": told}
+    scene = {"scale": IN_MM.as_dict(), "frame": axes}
     (folder / "results" / "scene.json").write_text(json.dumps(scene))
     write_dicom(folder, tmp_path / "out", views=0)
     for name in turns:
         found = read(tmp_path / "out", f"{Path(name).stem}.dcm")
         held = np.frombuffer(found.EncapsulatedDocument, "<f4", 9, 84 + 12).reshape(3, 3)
-        np.testing.assert_array_equal(
-            held, np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], 1)
-        )
-        assert found.ContentDescription.endswith("x left, y back, z head")
+        if frame == "mouth":
+            turned = np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], 1)
+            np.testing.assert_array_equal(held, turned)
+            assert found.ContentDescription.endswith("x left, y back, z head")
+        else:
+            np.testing.assert_array_equal(held, corners)
+            assert found.ContentDescription.endswith("those of the cameras")
         assert found.ModelModification == ("YES" if name.startswith("model") else "NO")
 
 

@@ -6,7 +6,7 @@ Frames of a mouth and of what stands upright have one convention: x to the right
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -41,16 +41,27 @@ class Frame:
         name: ``mouth``, ``upright``, ``input`` or ``world``.
         from_world: [4, 4] similarity from our world.
         lacking: what was asked for and can't be had, as a sentence; empty: it is as asked.
+        mouth_from_world: [4, 4], of the cameras; None: not known.
     """
 
     name: str
     from_world: Array
     lacking: str = ""
+    mouth_from_world: Array | None = None
 
     @property
     def stands(self) -> bool:
         """Has it x right, y up, z towards the viewer?"""
         return self.name in ("mouth", "upright")
+
+    @property
+    def to_mouth(self) -> Array | None:
+        """[4, 4] rotation and shift, in its units, to the frame of the mouth; None: not known."""
+        if self.name == "mouth" or self.mouth_from_world is None:
+            return np.eye(4) if self.name == "mouth" else None
+        found = self.mouth_from_world @ np.linalg.inv(self.from_world)
+        found[:3] /= np.cbrt(np.linalg.det(found[:3, :3]))
+        return found
 
 
 def frame_of(cameras: Cameras, wanted: Wanted = "auto") -> Frame:
@@ -58,6 +69,10 @@ def frame_of(cameras: Cameras, wanted: Wanted = "auto") -> Frame:
 
     In millimetres where they are known; else in the units of given cameras; else in our world's.
     """
+    return replace(_frame_of(cameras, wanted), mouth_from_world=cameras.mouth_from_world)
+
+
+def _frame_of(cameras: Cameras, wanted: Wanted) -> Frame:
     given = cameras.input_from_world
     if wanted == "world":
         return Frame("world", np.eye(4))

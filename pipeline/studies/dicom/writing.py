@@ -100,6 +100,7 @@ def _solids(
 
     found, left_out = [], {}
     turned = frame.get("file_from_frame", {})
+    stands = frame.get("name") in _Z_UP_AXES
     for path in sorted(results.glob("*.stl")):
         measured = scale.unit == "mm" and "without_scale" not in path.name
         if not measured and not unscaled:
@@ -112,7 +113,8 @@ def _solids(
         title = f"Surface from photographs, {scale.short}"[:64]
         data, axes = path.read_bytes(), str(frame.get("axes", ""))
         if path.name in turned:
-            data = _turned(data, Z_UP @ np.linalg.inv(np.array(turned[path.name], np.float64)))
+            upright = Z_UP if stands else np.eye(4)
+            data = _turned(data, upright @ np.linalg.inv(np.array(turned[path.name], np.float64)))
             axes = _Z_UP_AXES.get(frame.get("name", ""), axes)
         found.append(
             Solid(

@@ -48,20 +48,21 @@ class Writer:
         can be measured on it."""
         comments = [f"dentalsplat: {self.scale.text}"]
         write_mesh_ply(self.folder / mesh_name(stem, "ply", self.scale), mesh, comments)
-        self.plain(stem, mesh)
+        self.plain(stem, mesh, "z up" if self.frame.stands else "")
         if colored is not None:
             name = mesh_name(stem, "glb", self.scale)
             extras = {"scale": self.scale.as_dict(), "frame": self.frame.name}
             write_glb(self.folder / name, colored.moved(self._turned(name)), extras)
 
-    def plain(self, stem: str, mesh: Mesh) -> None:
-        """The shape alone, as .stl."""
+    def plain(self, stem: str, mesh: Mesh, lies: str = "") -> None:
+        """The shape alone, as .stl, whose header may say how it lies."""
         name = mesh_name(stem, "stl", self.scale)
-        said = f"{self.scale.short}{', z up' if self.frame.stands else ''}"
+        said = ", ".join(filter(None, (self.scale.short, lies)))
         write_stl(self.folder / name, moved(mesh, self._turned(name)), said)
 
     def _turned(self, name: str) -> Array:
-        return file_from_frame(name, self.frame.stands, self.scale.unit == "mm")
+        frame = self.frame
+        return file_from_frame(name, frame.stands, self.scale.unit == "mm", frame.to_mouth)
 
 
 def write_meshes(
@@ -84,7 +85,6 @@ def write_models(
     writer: Writer,
     mesh: Mesh,
     jaws: Mapping[Jaw, Bools],
-    mouth_from_world: Array | None,
     height: float,
     depth: float,
     most_faces: int,
@@ -93,7 +93,6 @@ def write_models(
 
     Args:
         mesh, jaws: see `write_meshes`.
-        mouth_from_world: [4, 4], of the cameras.
         height, depth: mm, see `solid.closed`.
         most_faces: triangles of a model, at most.
 
@@ -104,10 +103,9 @@ def write_models(
         return "no scale is known, so nobody can say how high a base is"
     if not jaws:
         return "nothing says which part of the mesh belongs to which jaw"
-    if mouth_from_world is None:
+    mouth = writer.frame.to_mouth
+    if mouth is None:
         return "too few teeth are known with their numbers to tell where the occlusal plane lies"
-    mouth = mouth_from_world @ np.linalg.inv(writer.frame.from_world)
-    mouth[:3] /= np.cbrt(np.linalg.det(mouth[:3, :3]))  # millimetres stay
     lacking = []
     for jaw, kept in jaws.items():
         up = mouth if jaw == "upper" else _LOWER_UP @ mouth
@@ -120,7 +118,7 @@ def write_models(
         if model is None or not is_closed(model):
             lacking.append(jaw)
             continue
-        writer.plain(f"model_{jaw}", moved(model, np.linalg.inv(up)))
+        writer.plain(f"model_{jaw}", moved(model, np.asarray(np.linalg.inv(up))))
     if lacking:
         return f"the surface of the {' and '.join(lacking)} jaw could not be closed"
     return ""
