@@ -71,4 +71,9 @@ def test_a_frame_that_can_not_be_had_is_said() -> None:
     assert found.name == "upright" and "asked for" in found.lacking and found.stands
     assert not frame_of(replace(bare, mouth_from_world=MOUTH), "mouth").lacking
     assert frame_of(bare, "world").name == "world" and not frame_of(bare, "world").stands
-    assert frame_of(Cameras((CAMERA,)), "input").name == "world"
+    assert not frame_of(bare, "input").lacking
+    alone = replace(bare, given=False, scale=TEXTBOOK)  # millimetres are no given cameras
+    for cameras, name in ((alone, "upright"), (replace(alone, mouth_from_world=MOUTH), "mouth")):
+        found = frame_of(cameras, "input")
+        assert found.name == name and "no cameras were given" in found.lacking
+        np.testing.assert_array_equal(found.from_world, frame_of(cameras).from_world)

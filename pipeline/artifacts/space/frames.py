@@ -76,17 +76,19 @@ def _frame_of(cameras: Cameras, wanted: Wanted) -> Frame:
     given = cameras.input_from_world
     if wanted == "world":
         return Frame("world", np.eye(4))
-    if wanted == "input":
-        name = "world" if np.array_equal(given, np.eye(4)) else "input"
-        return Frame(name, given)
-    if wanted == "auto" and cameras.given:
+    if wanted in ("auto", "input") and cameras.given:
         return Frame("input", given)
+    lacking = ""
+    if wanted == "input":
+        lacking = (
+            "The frame of given cameras was asked for, but no cameras were given. The exports are "
+            "in the frame that 'auto' means instead."
+        )
     known = cameras.given or cameras.scale.unit == "mm"
     scale = float(np.cbrt(np.linalg.det(given[:3, :3]))) if known else 1.0
     enlarged = np.diag([scale, scale, scale, 1.0])
     if wanted != "upright" and cameras.mouth_from_world is not None:
-        return Frame("mouth", enlarged @ cameras.mouth_from_world)
-    lacking = ""
+        return Frame("mouth", enlarged @ cameras.mouth_from_world, lacking)
     if wanted == "mouth":
         lacking = (
             "The frame of a mouth was asked for, but too few of its teeth "
