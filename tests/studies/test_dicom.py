@@ -103,7 +103,10 @@ def test_all_meshes_are_in_the_same_axes(frame: str, tmp_path: Path) -> None:
         else:
             np.testing.assert_array_equal(held, corners)
             assert found.ContentDescription.endswith("those of the cameras")
-        assert found.ModelModification == ("YES" if name.startswith("model") else "NO")
+        modified = name.startswith("model")
+        assert found.ModelModification == ("YES" if modified else "NO")
+        title = "Closed model, upper jaw, back and base made up" if modified else "Surface from"
+        assert found.DocumentTitle.startswith(title), "an archive shows no file names"
 
 
 def test_nobody_is_named_unless_asked(tmp_path: Path) -> None:

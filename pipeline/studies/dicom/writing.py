@@ -16,6 +16,7 @@ from pydicom.dataset import Dataset
 from pydicom.errors import BytesLengthException, InvalidDicomError
 from pydicom.filereader import read_file_meta_info
 
+from pipeline.artifacts.dental.fdi import JAWS
 from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.files import read_json, temporary_beside
@@ -110,7 +111,7 @@ def _solids(
             )
             continue
         modified = path.stem.startswith(_MODIFIED)
-        title = f"Surface from photographs, {scale.short}"[:64]
+        title = f"{_what(path.stem)}, {scale.short}"
         data, axes = path.read_bytes(), str(frame.get("axes", ""))
         if path.name in turned:
             upright = Z_UP if stands else np.eye(4)
@@ -123,6 +124,14 @@ def _solids(
             )
         )  # fmt: skip
     return found, left_out
+
+
+def _what(stem: str) -> str:
+    """What a mesh is, in words: an archive shows no file names."""
+    jaw = next((f", {jaw} jaw" for jaw in JAWS if f"_{jaw}" in stem), "")
+    if stem.startswith(_MODIFIED):
+        return f"Closed model{jaw}, back and base made up"
+    return f"Surface from photographs{jaw}"
 
 
 def _turned(stl: bytes, turn: npt.NDArray[np.float64]) -> bytes:
