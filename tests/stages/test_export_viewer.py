@@ -14,6 +14,7 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import to_uint8
 from stages.export.pictures.orbits import find_orbit
 from stages.export.splats import visible
+from stages.export.viewer.lighter import with_degree
 from stages.export.viewer.page import build_page, rasterizer_constants
 from stages.splatting.rendering import render
 from tests.browser import browse, console, needs_chromium
@@ -25,13 +26,15 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(error, 1e-12)))
 
 
-def page(degree: int = 1, photos: bool = True, gaussians: Gaussians | None = None) -> str:
+def page(
+    degree: int = 1, photos: bool = True, gaussians: Gaussians | None = None, carried: int = 3
+) -> str:
     gaussians = gaussians or scene.ball_gaussians(degree=degree)
     cameras = scene.ball_cameras()
     pictures = {camera.name: to_uint8(render(gaussians, camera).image) for camera in cameras}
     return build_page(
         gaussians, cameras, find_orbit(cameras, [3.0] * 3), pictures if photos else {},
-        rasterizer_constants(gaussians, cameras),
+        rasterizer_constants(gaussians, cameras), carried,
     )  # fmt: skip
 
 
@@ -60,6 +63,12 @@ def test_the_page_is_whole_and_needs_no_network() -> None:
         jpeg = base64.b64decode(view["photo"].partition(",")[2])
         assert b"Exif" not in jpeg
         assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1).shape == (120, 160, 3)
+
+
+def test_a_page_of_fewer_harmonics_has_the_colours_of_the_photographs() -> None:
+    ball = scene.ball_gaussians(degree=2)
+    fewer = with_degree(ball, scene.ball_cameras(), 1)
+    assert page(gaussians=ball, photos=False, carried=1) == page(gaussians=fewer, photos=False)
 
 
 @needs_chromium

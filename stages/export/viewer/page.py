@@ -19,6 +19,7 @@ from pipeline.artifacts.space.scale import NO_SCALE
 from stages.export.pictures.orbits import Orbit
 from stages.export.splats import PER_ROW, texels, visible
 from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
+from stages.export.viewer.lighter import with_degree
 from stages.splatting.rendering import used_degree
 
 HERE = Path(__file__).parent
@@ -158,7 +159,8 @@ def build_page(
         orbit: frame of the cameras.
         photos: camera name -> RGB [H, W, 3] to compare with; may hold none, or only some.
         rasterizer: see `rasterizer_constants`, so that the page draws what the fit has seen.
-        sh_degree: highest spherical-harmonics degree to carry.
+        sh_degree: highest spherical-harmonics degree to carry; where that is less than the scene
+            has, those are fitted to the colours that the cameras see.
         jpeg_quality: of the photographs.
         knowledge: what else is known of the scene, for the tools of the page.
 
@@ -166,7 +168,8 @@ def build_page(
         The text of a self-contained HTML file: no names, no paths, no network.
     """
     known = knowledge or Knowledge()
-    described, splats = pack_scene(gaussians, orbit, rasterizer, sh_degree, known)
+    carried = with_degree(gaussians, cameras, sh_degree)
+    described, splats = pack_scene(carried, orbit, rasterizer, sh_degree, known)
     views = []
     for camera in cameras:
         view = describe_camera(camera)
