@@ -56,7 +56,7 @@ class SplatsStage(Stage):
     """A 3DGS `.ply` -> Gaussians in our world."""
 
     name: ClassVar[str] = "splats"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     summary: ClassVar[str] = "take Gaussians that another program fitted (3DGS .ply)"
     Config: ClassVar[type[StageConfig]] = SplatsConfig
     requires: ClassVar[tuple[str, ...]] = ("cameras",)
