@@ -51,7 +51,7 @@ def reduce_cloud(
     is_fill = cloud.confidence <= fill_confidence
     known, fill = cloud[~is_fill], cloud[is_fill]
     spacing = median_spacing((known if len(known) > 1 else fill).positions, threads)
-    known_budget = fill_budget = 0
+    known_budget = fill_budget = None
     if target_points:
         # A share of at most all that is there: with no fill, or nothing else, nobody goes short.
         proportional = int(target_points * len(fill) / max(len(cloud), 1))
@@ -70,10 +70,10 @@ def reduce_cloud(
     return Reduction(joined, len(fill))
 
 
-def _thin(cloud: Cloud, size: float, budget: int, spacing: float) -> tuple[Cloud, float]:
-    """Downsample with voxels of `size`, or larger if `budget` (0: none) needs it."""
-    if len(cloud) == 0:
-        return cloud, 0.0
-    if budget:
+def _thin(cloud: Cloud, size: float, budget: int | None, spacing: float) -> tuple[Cloud, float]:
+    """Downsample with voxels of `size`, or larger if `budget` (None: there is none) needs it."""
+    if len(cloud) == 0 or budget == 0:
+        return cloud[:0], 0.0
+    if budget is not None:
         size = max(size, voxel_size_for(cloud.positions, budget, spacing))
     return (voxel_downsample(cloud, size), size) if size > 0 else (cloud, 0.0)

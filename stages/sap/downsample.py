@@ -30,7 +30,7 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.integer]) -> Cloud:
+    def __getitem__(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.integer] | slice) -> Cloud:
         return Cloud(
             self.positions[index], self.colors[index], self.normals[index], self.confidence[index]
         )

@@ -147,6 +147,8 @@ def test_fill_neither_eats_the_budget_nor_vanishes():
     )  # fmt: skip
     assert len(few_known.cloud) - few_known.fill == 50
     assert few_known.fill > 700
+    without = reduce_cloud(both, 1.0, 1000, 1.25, 0.0, 1)  # no share of the budget is no fill
+    assert without.fill == 0 and 850 < len(without.cloud) <= 1000
 
 
 def test_any_thread_count_gives_the_same_bytes(tmp_path):
