@@ -7,6 +7,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
@@ -82,6 +83,7 @@ def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Re
     truth = _truth(context, [*views.views, *held])
     held = _straightened(context, views, cameras, held) if truth is not None else held
     regions = {view.name: scoring_mask(masks, view) for view in (*views.views, *held)}
+    _check_masks(context, masks, [*views.views, *held], regions)
     weights = next(iter(labelled(context.sources, "lpips").values()), None)
     examiner = Examiner(
         draw, config, context.output("metrics"),
@@ -139,6 +141,26 @@ def _placed_cameras(views: Views, placed: Cameras) -> dict[str, Camera]:
             "Cameras from outside must carry the names of the views."
         )
     return found
+
+
+def _check_masks(
+    context: StageContext, masks: Mapping[str, Path], views: list[View],
+    regions: Mapping[str, npt.NDArray[np.bool_] | None],
+) -> None:  # fmt: skip
+    """Say which masks for scoring mark nothing; their figures would be missing without a word."""
+    given = {view.source_name or view.name: regions[view.name] for view in views}
+    if masks and all(region is None for region in given.values()):
+        raise RequestError(
+            f"evaluate.masks: none of the masks there is named as a photograph: they have names "
+            f"like {min(masks)}, the photographs like {min(given)}. A mask bears the name of its "
+            "photograph, such as 003.png for 003.jpg."
+        )
+    empty = [name for name, region in given.items() if region is not None and not region.any()]
+    if empty:
+        context.warn(
+            f"evaluate.masks: no pixel of the masks of {', '.join(empty)} is 255, so that nothing "
+            "is scored inside them."
+        )
 
 
 def _truth(context: StageContext, views: list[View]) -> Truth | None:

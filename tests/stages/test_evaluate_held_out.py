@@ -109,6 +109,18 @@ def test_everything_where_the_reconstruction_is_exact(tmp_path: Path) -> None:
     assert novel["first"]["unsupported"] >= held["registered"]["mean"]["unsupported"]
 
 
+def test_masks_that_mark_nothing_are_said(tmp_path: Path) -> None:
+    inputs = case(tmp_path)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    write_png(masks / "p1_mask.png", np.full((72, 96), 255, np.uint8))
+    with pytest.raises(RequestError, match=r"like p1_mask\.png, the photographs like p0\.png"):
+        run(tmp_path / "other", inputs, masks=str(masks), flip=False)
+    write_png(masks / "p0.png", np.ones((72, 96), np.uint8))  # 1 for a tooth, not 255
+    context = run(tmp_path / "ones", inputs, masks=str(masks), flip=False, novel_angle=0)
+    assert any("masks of p0.png is 255" in text for text in context.warnings)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_masks_lie_as_they_do_for_the_stage_views(tmp_path: Path, orientation: int) -> None:
     """Upright, or stored where only that has their shape; of a mirror image turned back, too."""
