@@ -125,11 +125,13 @@ def test_colmap_model_is_found_in_the_usual_folders_and_reads_like_transforms(tm
         np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-6)
 
 
-def test_distortion_is_taken_out_of_the_image(tmp_path):
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [("SIMPLE_RADIAL", [500, 256, 192, -0.2]), ("SIMPLE_FISHEYE", [400, 256, 192])],
+)
+def test_distortion_is_taken_out_of_the_image(model, parameters):
     """A picture of straight lines, bent by the lens, is straight again."""
-    lens = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=512, height=384, params=[500, 256, 192, -0.2]
-    )
+    lens = pycolmap.Camera(model=model, width=512, height=384, params=parameters)
     v, u = np.mgrid[:384, :512] + 0.5
     rays = lens.cam_from_img(np.stack([u.ravel(), v.ravel()], 1))
     # Each pixel shows a chequered plane in front of the camera.

@@ -237,20 +237,34 @@ def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[
     """
     lens = known.lens
     camera = pinhole_camera(view, known, setting)
-    working_from_lens = working_pixels_from_lens(view, known, setting)
-    turn = _turn(working_from_lens)
-    distortion = [lens.params[index] for index in lens.extra_params_idxs()]
-    if not np.any(np.abs(distortion) > 1e-9):
+    coefficients = np.array([lens.params[index] for index in lens.extra_params_idxs()])
+    # a fisheye lens bends the picture without any coefficient, too
+    if "FISHEYE" not in lens.model_name and not (np.abs(coefficients) > 1e-9).any():
         return view, camera
-    v, u = np.mgrid[: view.height, : view.width] + 0.5
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    pixels = lens.img_from_cam(np.ascontiguousarray((rays @ turn).reshape(-1, 3)))
-    pixels = np.clip(np.where(np.isfinite(pixels), pixels, -1e6), -1e6, 1e6)
-    source = pixels @ working_from_lens[:2, :2].T + working_from_lens[:2, 2] - 0.5
-    straight = resampled(view, source.reshape(view.height, view.width, 2))
+    source = _distorted(view, known, camera, setting)
+    straight = resampled(view, source)
     parameters = " ".join(f"{value:.9g}" for value in lens.params)
     text = f"{lens.model_name} {lens.width} {lens.height} {parameters}"
     return replace(straight, lens_taken_out=text), camera
+
+
+def bending(view: View, known: KnownCamera, setting: str = SETTING) -> float:
+    """By how many pixels at most the distortion of a lens moves what its view shows."""
+    straight = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), -1)
+    bent = _distorted(view, known, pinhole_camera(view, known, setting), setting)
+    return float(np.linalg.norm(bent - straight, axis=-1).max())
+
+
+def _distorted(view: View, known: KnownCamera, camera: Camera, setting: str) -> Array:
+    """[H, W, 2] where a view has what a pinhole camera sees at each pixel (`resampled`)."""
+    working_from_lens = working_pixels_from_lens(view, known, setting)
+    turn = _turn(working_from_lens)
+    v, u = np.mgrid[: view.height, : view.width] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    pixels = known.lens.img_from_cam(np.ascontiguousarray((rays @ turn).reshape(-1, 3)))
+    pixels = np.clip(np.where(np.isfinite(pixels), pixels, -1e6), -1e6, 1e6)
+    source = pixels @ working_from_lens[:2, :2].T + working_from_lens[:2, 2] - 0.5
+    return np.asarray(source.reshape(view.height, view.width, 2))
 
 
 def resampled(view: View, source: npt.NDArray[np.floating[Any]]) -> View:
