@@ -17,6 +17,8 @@ from pipeline.stage import Stage, StageConfig, StageContext, runtime
 from pipeline.untrusted.paths import GivenPath
 
 SETTING = "swap.cameras"
+#: Distortion of the photographs, in pixels, that is worth a word.
+_BENT = 0.5
 
 
 class SwapConfig(StageConfig):
@@ -62,6 +64,7 @@ class SwapStage(Stage):
         from dataclasses import replace
 
         from pipeline.geometry.models.known_cameras import (
+            bending,
             matching_cameras,
             pinhole_camera,
             read_cameras,
@@ -91,6 +94,18 @@ class SwapStage(Stage):
             moved = {
                 name: replace(now[name], cam_from_world=moved[name].cam_from_world) for name in both
             }
+        bent = [
+            bending(v, known[v.name], SETTING)
+            for v in views.views
+            if v.name in known and not v.lens_taken_out
+        ]
+        if max(bent, default=0.0) > _BENT:
+            context.warn(
+                f"The model's lenses distort the photographs by up to {max(bent):.1f} pixels, and "
+                "this stage leaves the photographs as they are: what they show lies that far off. "
+                "Give the model of undistorted photographs, or start from these cameras with "
+                "init.cameras, which takes the distortion out."
+            )
         dropped = sorted(set(now) - set(moved))
         if dropped:
             context.warn(f"The model has no camera of view {', '.join(dropped)}; left out.")

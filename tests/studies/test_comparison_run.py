@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -237,8 +238,6 @@ def swapped(tmp_path, model, present, **settings):
 
 
 def test_cameras_are_swapped_for_a_models_in_the_same_world(tmp_path, model):
-    from dataclasses import replace
-
     truth = true_cameras()
     named = [replace(c, name=f"{k:03d}", fx=900.0, fy=900.0) for k, c in enumerate(truth)]
     present = Cameras(tuple(named), np.diag([2.0, 2, 2, 1]), Scale("mm"))
@@ -252,6 +251,15 @@ def test_cameras_are_swapped_for_a_models_in_the_same_world(tmp_path, model):
     alone = Cameras(present.cameras[:1])
     with pytest.raises(RequestError, match=r"swap\.cameras: only 1"):
         swapped(tmp_path, model, alone)
+
+
+def test_swap_says_that_it_leaves_distortion_in(tmp_path, model):
+    named = [replace(c, name=f"{k:03d}") for k, c in enumerate(true_cameras())]
+    told = json.loads((SAMPLES / "transforms.json").read_text()) | {"k1": -0.3}
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    bent = swapped(tmp_path, tmp_path / "transforms.json", Cameras(tuple(named)))
+    assert len(bent.warnings) == 1 and "by up to 9.8 pixels" in bent.warnings[0]
+    assert swapped(tmp_path / "straight", model, Cameras(tuple(named))).warnings == []
 
 
 def test_swap_without_cameras_is_refused():
