@@ -59,15 +59,16 @@ def pointmap_files(folder: Path | None) -> list[Path]:
     """
     if folder is None:
         raise RequestError(
-            "init.method is files, but no folder of pointmaps is named; set its path (files)."
+            "init.method is files, but no folder of pointmaps is named. Give it: --set "
+            "init.pointmap.files=FOLDER."
         )
     if not folder.is_dir():
-        raise RequestError(f"files: there is no folder {folder}.")
+        raise RequestError(f"init.pointmap.files: there is no folder {folder}.")
     found = sorted(folder.glob("*.npz"))
     if not found:
         raise RequestError(
-            f"files: the folder {folder} holds no .npz file; one per pair is expected, with the "
-            f"arrays {', '.join(KEYS)} and the names of the two photographs."
+            f"init.pointmap.files: the folder {folder} holds no .npz file; one per pair is "
+            f"expected, with the arrays {', '.join(KEYS)} and the names of the two photographs."
         )
     return found
 
@@ -85,7 +86,9 @@ def match_names(files: Sequence[Path], views: Sequence[View], meaning: str) -> l
         RequestError: names that fit no view, that fit both ways, or two files for one pair.
     """
     if meaning not in ("auto", "source", "neutral"):
-        raise RequestError(f"file_names is '{meaning}'; choose auto, source or neutral.")
+        raise RequestError(
+            f"init.pointmap.file_names is '{meaning}'; choose auto, source or neutral."
+        )
     keys = {"source": _by_source(views), "neutral": {v.name: k for k, v in enumerate(views)}}
     stated = [_stated_names(path) for path in files]
     attempts: dict[str, list[tuple[int, int] | None]] = {
@@ -97,7 +100,8 @@ def match_names(files: Sequence[Path], views: Sequence[View], meaning: str) -> l
     if len(complete) == 2 and complete["source"] != complete["neutral"]:
         raise RequestError(
             f"The names of the pointmaps ({files[0].name}) are both file names of photographs and "
-            "names of views, and mean different ones. Say which: file_names: source or neutral."
+            "names of views, and mean different ones. Say which: "
+            "init.pointmap.file_names=source or neutral."
         )
     if not complete:
         best = max(attempts.values(), key=lambda found: sum(one is not None for one in found))
@@ -109,11 +113,13 @@ def match_names(files: Sequence[Path], views: Sequence[View], meaning: str) -> l
             else "no names, and its file name"
         )
         allowed = sorted({name for known in keys.values() for name in known})
-        near = nearest(given[0], allowed) if given else ""
+        stranger = next((name for name in given or () if Path(name).name not in allowed), "")
         raise RequestError(
-            f"{files[worst]} holds {what} which are no two of the photographs "
-            f"({', '.join(v.source_name or v.name for v in views)}).{near} Name the photographs in "
-            "the array names, or the file <i>_<j>.npz."
+            f"{files[worst]} holds {what} which are no two of the photographs in use "
+            f"({', '.join(v.source_name or v.name for v in views)})."
+            f"{nearest(stranger, allowed) if stranger else ''} Name the photographs in the array "
+            "names, or the file <i>_<j>.npz, and leave out files of photographs that are held out "
+            "or set aside."
         )
     result: list[PairFile] = []
     seen: dict[tuple[int, int], Path] = {}

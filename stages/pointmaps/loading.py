@@ -49,7 +49,7 @@ def import_module(
     top = package or card.package
     if folder is not None:
         if not folder.is_dir():
-            raise RequestError(f"package_folder: there is no folder {folder}.")
+            raise RequestError(f"init.pointmap.package_folder: there is no folder {folder}.")
         if str(folder) not in sys.path:
             sys.path.insert(0, str(folder))
             importlib.invalidate_caches()
@@ -85,12 +85,13 @@ def choose_device(name: str) -> Any:
         device = torch.device(name)
     except RuntimeError as error:
         raise RequestError(
-            f"There is no device '{name}'; choose auto, cpu, cuda or cuda:<number>."
+            f"init.pointmap.device: there is no device '{name}'; choose auto, cpu, cuda or "
+            "cuda:<number>."
         ) from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise RequestError(
-            f"device: {name} was asked for, but torch {torch.__version__} finds no CUDA device "
-            "here. Use device: cpu, or a build of torch with CUDA."
+            f"init.pointmap.device: {name} was asked for, but torch {torch.__version__} finds no "
+            "CUDA device here. Use init.pointmap.device=cpu, or a build of torch with CUDA."
         )
     return device
 
@@ -107,7 +108,7 @@ def checkpoint_file(card: ModelCard, checkpoint: Path | None, folder_allowed: bo
     if not there:
         raise RequestError(
             f"There are no weights of {card.title} at {checkpoint}. {card.weights} Then give their "
-            "path as checkpoint."
+            "path as init.pointmap.checkpoint."
         )
     return checkpoint
 
@@ -117,8 +118,8 @@ def required_checkpoint(card: ModelCard, checkpoint: Path | None) -> Path:
     path = checkpoint_file(card, checkpoint, folder_allowed=False)
     if path is None:
         raise RequestError(
-            f"{card.title} needs the path of its weights (checkpoint). {card.weights} Licence of "
-            f"the weights: {card.weights_licence}."
+            f"{card.title} needs the path of its weights (init.pointmap.checkpoint). "
+            f"{card.weights} Licence of the weights: {card.weights_licence}."
         )
     return path
 
@@ -149,7 +150,7 @@ def offline(card: ModelCard) -> Iterator[None]:
     except torch.cuda.OutOfMemoryError as error:
         raise RequestError(
             f"The GPU's memory is too small for {card.title} and these photographs. Use fewer or "
-            "smaller ones (long_side), or device: cpu."
+            "smaller ones (init.pointmap.long_side), or init.pointmap.device=cpu."
         ) from error
     except Exception as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -86,14 +86,18 @@ def check_memory(
         fewer = (
             "fewer views"
             if multi_view
-            else "smaller images (long_side)"
-            + (", fewer pairs (graph: window or star, symmetric: false)" if on_cpu else "")
+            else "smaller images (init.pointmap.long_side)"
+            + (
+                ", fewer pairs (init.pointmap.graph=window or star, init.pointmap.symmetric=false)"
+                if on_cpu
+                else ""
+            )
         )
-        other = "a GPU" if on_cpu else "device: cpu"
+        other = "a GPU" if on_cpu else "init.pointmap.device=cpu"
         raise RequestError(
             f"{card.title} needs about {needed:.1f} GB of memory for these photographs, but "
             f"{available:.1f} GB are free on {device}. Use {fewer}, free memory, or {other}; "
-            "max_memory_gb overrides this estimate."
+            "init.pointmap.max_memory_gb overrides this estimate."
         )
     if not on_cpu and limit_gb is None:
         main = free_main_gb()

@@ -62,7 +62,7 @@ def test_photographs_are_found_by_file_name_stem_or_path(tmp_path):
 def test_names_that_mean_two_things_are_asked_about(tmp_path):
     photographs = views("001.jpg", "002.jpg", "000.jpg")
     np.savez(tmp_path / "001_002.npz", **arrays())
-    with pytest.raises(RequestError, match="file_names"):
+    with pytest.raises(RequestError, match=r"init\.pointmap\.file_names=source"):
         read(tmp_path, photographs)
     assert read(tmp_path, photographs, "source")[0].name_i == "000"
     assert read(tmp_path, photographs, "neutral")[0].name_i == "001"
@@ -125,7 +125,7 @@ def test_bad_values_and_masked_pixels_are_unknown(tmp_path):
         ({"points_i": np.ones((*SIZE, 4))}, "shape"),
         ({"confidence_j": np.full(SIZE, 0.7)}, "add 1"),
         ({"names": ["a.jpg"]}, "1 names instead of 2"),
-        ({"names": ["a.jpg", "c.jpg"]}, "no two of the photographs"),
+        ({"names": ["a.jpg", "c.jpg"]}, "no two of the photographs in use .* or set aside"),
         ({"transform_i": np.eye(4)}, "3x3"),
         ({"transform_from": "original"}, "working or source"),
         ({"points_i": np.array([{}], object)}, "can't be read|lacks"),
@@ -138,11 +138,17 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, message):
     assert "a_b.npz" in str(caught.value)
 
 
+def test_a_name_that_is_there_is_not_taken_for_a_mistake(tmp_path):
+    np.savez(tmp_path / "1.npz", **arrays(), names=["front.jpg", "lefft.jpg"])
+    with pytest.raises(RequestError, match=r"Did you mean 'left\.jpg'"):
+        read(tmp_path, views("front.jpg", "left.jpg"))
+
+
 def test_missing_arrays_broken_files_and_wrong_shapes(tmp_path):
     photographs = views("a.jpg", "b.jpg")
     with pytest.raises(RequestError, match="no folder"):
         read(tmp_path / "nothing", photographs)
-    with pytest.raises(RequestError, match="no folder of pointmaps is named"):
+    with pytest.raises(RequestError, match=r"--set init\.pointmap\.files=FOLDER"):
         predict_pointmaps(photographs, False, PointmapOptions("files"))
     with pytest.raises(RequestError, match=r"no \.npz"):
         read(tmp_path, photographs)

@@ -22,7 +22,8 @@ class Dust3r:
         package="dust3r",
         repository="https://github.com/naver/dust3r",
         install="git clone --recursive https://github.com/naver/dust3r && pip install -r "
-        "dust3r/requirements.txt, then name the checkout as package_folder (or on PYTHONPATH)",
+        "dust3r/requirements.txt, then name the checkout as init.pointmap.package_folder (or on "
+        "PYTHONPATH)",
         code_licence="CC BY-NC-SA 4.0 (not for commercial use)",
         weights_licence="CC BY-NC-SA 4.0 and the terms of the training data",
         weights="DUSt3R_ViTLarge_BaseDecoder_512_dpt.pth is linked in the README of the "

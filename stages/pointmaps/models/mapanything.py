@@ -36,8 +36,8 @@ class MapAnything:
         weights_licence="facebook/map-anything: CC BY-NC 4.0; facebook/map-anything-apache: "
         "Apache 2.0",
         weights="huggingface-cli download facebook/map-anything-apache --local-dir FOLDER fetches "
-        "them (checkpoint is that folder); its image encoder also wants the code of DINOv2 in "
-        "torch's hub cache: load the model once with the network on.",
+        "them (init.pointmap.checkpoint is that folder); its image encoder also wants the code of "
+        "DINOv2 in torch's hub cache: load the model once with the network on.",
         weights_gb=2.3,
         gb_per_image=0.35,
         pixels=518 * 392,

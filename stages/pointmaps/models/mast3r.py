@@ -18,7 +18,7 @@ class Mast3r(Dust3r):
         repository="https://github.com/naver/mast3r",
         install="git clone --recursive https://github.com/naver/mast3r && pip install -r "
         "mast3r/requirements.txt -r mast3r/dust3r/requirements.txt, then name the checkout as "
-        "package_folder (or on PYTHONPATH)",
+        "init.pointmap.package_folder (or on PYTHONPATH)",
         code_licence="CC BY-NC-SA 4.0 (not for commercial use)",
         weights_licence="CC BY-NC-SA 4.0 and the terms of the training data (CHECKPOINTS_NOTICE)",
         weights="MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth is linked in the README of "
