@@ -5,6 +5,7 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,12 +13,13 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from pipeline.errors import RequestError, did_you_mean, nearest, shown
 from pipeline.installed import shipped_configs
 from pipeline.measure import usable_cores
 from pipeline.stage import StageConfig, get_stage, stage_names, usable_stages
-from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.paths import names_path, user_path
 from pipeline.untrusted.plain_yaml import plain_yaml, read_plain_yaml
 
 DEFAULT_PRESET = "dentalsplat"
@@ -181,6 +183,43 @@ def parse_override(text: str) -> tuple[str, Any]:
         return key.strip(), plain_yaml(value, "it")
     except RequestError as error:
         raise RequestError(f"The value of --set {shown(text)} can't be read: {error}") from error
+
+
+def anchored(change: str) -> str:
+    """An override as it holds in every folder: what is a path, and not looked at for the key, in
+    whole. What can't be read stays as it is; `load_config` says what is wrong with it.
+    """
+    name, _, text = change.partition("=")
+    try:
+        section, *parts = name.strip().split(".")
+        field = _field_at(get_stage(section).Config, parts)
+        value = plain_yaml(text, "it")
+    except RequestError:
+        return change
+    fixed = {"affects_result": False}
+    if field is None or field.json_schema_extra != fixed or not isinstance(value, str):
+        return change
+    if not value or value.startswith("~") or not names_path(field):
+        return change
+    return f"{name}={yaml_value(os.path.abspath(value))}"  # noqa: PTH100 - keeps what is no path
+
+
+def yaml_value(value: Any) -> str:
+    """A value as --set has it."""
+    import yaml
+
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _field_at(model: type[BaseModel] | None, parts: Sequence[str]) -> FieldInfo | None:
+    field = None
+    for part in parts:
+        if model is None or part not in model.model_fields:
+            return None
+        field = model.model_fields[part]
+        model = model_in(field.annotation)
+    return field
 
 
 def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:

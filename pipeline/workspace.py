@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import load_config
+from pipeline.config import anchored, load_config, yaml_value
 from pipeline.errors import PipelineError, RequestError
 from pipeline.planning import plan_chain, resolve_chain
 from pipeline.store import Store, partial_name
@@ -117,7 +117,10 @@ def make_request(
     images_named = bool(given)
     taken_over: list[str] = []
     if isinstance(overrides, Mapping):
-        overrides = [f"{key}={_yaml_value(value)}" for key, value in overrides.items()]
+        overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
+    overrides = [anchored(change) for change in overrides]
+    if preset is not None and Path(preset).suffix in (".yaml", ".yml") and Path(preset).is_file():
+        preset = Path(preset).absolute()
     if not given:
         remembered = read_request(folder) if is_workspace(folder) else {}
         if as_before and preset is None and remembered:
@@ -145,13 +148,6 @@ def _still_there(path: str) -> bool:
         return any(c in path for c in "*?[") or Path(path).exists()
     except OSError:  # too long a name, a folder of somebody else's
         return False
-
-
-def _yaml_value(value: Any) -> str:
-    import yaml
-
-    text = yaml.safe_dump(value, default_flow_style=True, width=10**6)
-    return text.removesuffix("\n").removesuffix("\n...")
 
 
 def default_workspace(images: Sequence[str | Path]) -> Path:

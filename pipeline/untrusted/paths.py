@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeVar, get_args
 
 from pydantic import AfterValidator
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from pipeline.errors import RequestError
@@ -54,6 +55,13 @@ def _possible(text: Given) -> Given:
 #: it is there is told by the stage that wants it.
 POSSIBLE = AfterValidator(_possible)
 GivenPath = Annotated[str, POSSIBLE]
+
+
+def names_path(field: FieldInfo) -> bool:
+    """Is a setting a path?"""
+    return POSSIBLE in field.metadata or any(
+        POSSIBLE in get_args(part) for part in get_args(field.annotation)
+    )
 
 
 def _shown(text: str | Path) -> str:

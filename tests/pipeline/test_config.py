@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import load_config, parse_override, presets, result_fields
+from pipeline.config import load_config, parse_override, presets, result_fields, yaml_value
 from pipeline.errors import RequestError
-from pipeline.workspace import _yaml_value
+from pipeline.workspace import make_request
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -80,7 +80,7 @@ def test_runtime_fields_stay_out_of_the_result(toys: Path) -> None:
 
 @given(st.one_of(st.integers(), st.floats(allow_nan=False), st.booleans(), st.text(), st.none()))
 def test_values_survive_the_command_line(value: object) -> None:
-    key, parsed = parse_override(f"a.b={_yaml_value(value)}")
+    key, parsed = parse_override(f"a.b={yaml_value(value)}")
     assert key == "a.b"
     assert parsed == value
 
@@ -110,3 +110,23 @@ def test_settings_load_nothing_that_takes_long() -> None:
         [sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=ROOT
     )
     assert found.stdout.split() == []
+
+
+def test_paths_hold_in_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A workspace goes on with the settings of its last run, from wherever that is asked for."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").touch()
+    stay = (
+        "fit.iterations=4", "evaluate.mesh=~/teeth.ply", "init.cameras=/there", "swap.cameras=null",
+        "evaluate.masks", "nothing.masks=m", "evaluate.test_poses=both", "report=false",
+    )  # fmt: skip
+    given = ("evaluate.ground_truth=a/b.json", "init.pointmap.files='in: here'", "views.masks=m")
+    request = make_request("photos", "w", "mine.yaml", [*given, *stay])
+    assert request.preset == f"{tmp_path}/mine.yaml"
+    assert request.overrides == (
+        f"evaluate.ground_truth={tmp_path}/a/b.json",
+        f"init.pointmap.files='{tmp_path}/in: here'", f"views.masks={tmp_path}/m", *stay,
+    )  # fmt: skip
+    assert make_request("photos", "w", "paper", {"views.masks": "m"}).overrides == (
+        f"views.masks={tmp_path}/m",
+    )

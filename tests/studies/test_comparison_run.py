@@ -123,7 +123,7 @@ def test_a_rival_that_fails_says_why_and_the_rest_goes_on(workspace, tmp_path):
         ((), "Say what to compare with"),
         (("--run-colmap", "--colmap", "x"), "not both"),
         (("--colmap", "nowhere"), "--colmap: nowhere holds no COLMAP model"),
-        (("--run-colmap", "--ground-truth", "nowhere"), "--ground-truth: nowhere holds no cameras"),
+        (("--run-colmap", "--ground-truth", "nowhere"), "--ground-truth: there is no "),
         (("--run-colmap", "--mesh", "teeth.ply"), "--mesh needs --ground-truth"),
     ],
 )

@@ -57,6 +57,8 @@ def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
         RequestError: there is nothing of the kind.
     """
     path = user_path(path, setting)
+    if not path.exists():
+        raise RequestError(f"{setting}: there is no {path.absolute()}. Check the path.")
     if path.is_file() and path.suffix.lower() == ".json":
         return {"cameras/transforms.json": path}
     for folder in (path, path / "0", path / "sparse", path / "sparse" / "0"):
