@@ -102,12 +102,15 @@ def load_config(
 
 def result_fields(config: BaseModel) -> dict[str, Any]:
     """The config fields that can change the result, as JSON values: what enters the key."""
-    kept = {}
+    kept: dict[str, Any] = {}
     for name, field in type(config).model_fields.items():
         extra = field.json_schema_extra
         if isinstance(extra, dict) and extra.get("affects_result") is False:
             continue
         value = getattr(config, name)
+        if isinstance(value, str) and names_path(field):  # its content counts, not its place
+            kept[name] = "a file"
+            continue
         is_model = isinstance(value, BaseModel)
         kept[name] = result_fields(value) if is_model else config.model_dump(mode="json")[name]
     return kept
@@ -186,8 +189,9 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def anchored(change: str) -> str:
-    """An override as it holds in every folder: what is a path, and not looked at for the key, in
-    whole. What can't be read stays as it is; `load_config` says what is wrong with it.
+    """An override as it holds in every folder: a path in whole.
+
+    What can't be read stays as it is; `load_config` says what is wrong with it.
     """
     name, _, text = change.partition("=")
     try:
@@ -196,10 +200,9 @@ def anchored(change: str) -> str:
         value = plain_yaml(text, "it")
     except RequestError:
         return change
-    fixed = {"affects_result": False}
-    if field is None or field.json_schema_extra != fixed or not isinstance(value, str):
+    if field is None or not names_path(field) or not isinstance(value, str):
         return change
-    if not value or value.startswith("~") or not names_path(field):
+    if not value or value.startswith("~"):
         return change
     return f"{name}={yaml_value(os.path.abspath(value))}"  # noqa: PTH100 - keeps what is no path
 

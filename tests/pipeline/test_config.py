@@ -119,14 +119,27 @@ def test_paths_hold_in_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     stay = (
         "fit.iterations=4", "evaluate.mesh=~/teeth.ply", "init.cameras=/there", "swap.cameras=null",
         "evaluate.masks", "nothing.masks=m", "evaluate.test_poses=both", "report=false",
+        "init.dental.labels=[]",
     )  # fmt: skip
-    given = ("evaluate.ground_truth=a/b.json", "init.pointmap.files='in: here'", "views.masks=m")
+    given = (
+        "evaluate.ground_truth=a/b.json", "init.pointmap.files='in: here'", "views.masks=m",
+        "init.dental.labels=teeth.yaml",
+    )  # fmt: skip
     request = make_request("photos", "w", "mine.yaml", [*given, *stay])
     assert request.preset == f"{tmp_path}/mine.yaml"
     assert request.overrides == (
         f"evaluate.ground_truth={tmp_path}/a/b.json",
-        f"init.pointmap.files='{tmp_path}/in: here'", f"views.masks={tmp_path}/m", *stay,
+        f"init.pointmap.files='{tmp_path}/in: here'", f"views.masks={tmp_path}/m",
+        f"init.dental.labels={tmp_path}/teeth.yaml", *stay,
     )  # fmt: skip
     assert make_request("photos", "w", "paper", {"views.masks": "m"}).overrides == (
         f"views.masks={tmp_path}/m",
     )
+
+
+def test_the_place_of_a_file_is_not_in_the_key() -> None:
+    here, there, none = (
+        result_fields(load_config(None, given).sections["init"])
+        for given in (["init.dental.labels=a.yaml"], ["init.dental.labels=/b/a.yaml"], [])
+    )
+    assert here == there != none
