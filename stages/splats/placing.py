@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
-from pipeline.artifacts.space.frames import TURNED
+from pipeline.artifacts.space.frames import BACKGROUND, TURNED
 from stages.splatting.frame import move_gaussians
 
 #: Bytes of a `.ply` that its header fits into.
@@ -34,9 +34,23 @@ def unusable(gaussians: Gaussians) -> npt.NDArray[np.bool_]:
 
 def says_turned(path: Path) -> bool:
     """Is it one of our own files, or was made from one, that is turned for viewers?"""
+    return f"comment {TURNED}".encode("ascii") in _head(path)
+
+
+def said_background(path: Path) -> tuple[float, float, float]:
+    """The colour behind the scene that a file of ours says; black where it says none."""
+    said = _head(path).partition(f"comment {BACKGROUND}".encode("ascii"))[2].split(b"\n")[0]
+    try:
+        red, green, blue = (float(number) for number in said.split())
+    except ValueError:
+        return 0.0, 0.0, 0.0
+    known = all(0 <= channel <= 1 for channel in (red, green, blue))
+    return (red, green, blue) if known else (0.0, 0.0, 0.0)
+
+
+def _head(path: Path) -> bytes:
     with path.open("rb") as file:
-        head = file.read(HEADER).partition(b"end_header")[0]
-    return f"comment {TURNED}".encode("ascii") in head
+        return file.read(HEADER).partition(b"end_header")[0]
 
 
 def into_world(gaussians: Gaussians, frame_from_world: npt.NDArray[np.float64]) -> Gaussians:

@@ -46,9 +46,10 @@ class SplatsConfig(StageConfig):
         description="the file is turned by 180 degrees about z against that frame, as our own "
         "splats.ply is where the exports stand upright; null: as a comment in its header says",
     )
-    background: tuple[Channel, Channel, Channel] = Field(
-        (0.0, 0.0, 0.0),
-        description="colour that the other program had behind the scene, RGB in 0..1",
+    background: tuple[Channel, Channel, Channel] | None = Field(
+        None,
+        description="colour that the other program had behind the scene, RGB in 0..1; null: as a "
+        "comment in the file's header says, else black",
     )
 
 
@@ -82,13 +83,20 @@ class SplatsStage(Stage):
         """
         from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply
         from pipeline.artifacts.space.frames import VIEWERS_PLY, frame_of
-        from stages.splats.placing import into_world, says_turned, share_in_view, unusable
+        from stages.splats.placing import (
+            into_world,
+            said_background,
+            says_turned,
+            share_in_view,
+            unusable,
+        )
 
         config: SplatsConfig = context.config
         cameras = context.load("cameras")
         (path,) = context.sources.values()
         try:
-            given = Gaussians(**read_gaussians_ply(path), light=None, background=config.background)
+            background = config.background or said_background(path)
+            given = Gaussians(**read_gaussians_ply(path), light=None, background=background)
         except RequestError as error:
             raise RequestError(f"{SETTING}: {error}") from error
         if not len(given):

@@ -16,13 +16,14 @@ from pipeline import cli
 from pipeline.artifacts import gaussians as files
 from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply, write_gaussians_ply
+from pipeline.artifacts.space.frames import BACKGROUND
 from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.running.outcomes import RunSummary
 from pipeline.stage import LocalContext
 from stages.evaluate.stage import EvaluateConfig, EvaluateStage
 from stages.export.stage import ExportConfig, ExportStage
-from stages.splats.placing import share_in_view
+from stages.splats.placing import said_background, share_in_view
 from stages.splats.stage import SplatsConfig, SplatsStage
 from stages.splatting import render
 from stages.splatting.frame import move_gaussians
@@ -88,10 +89,11 @@ def test_our_own_export_comes_back_as_it_was(tmp_path: Path, frame: str) -> None
     exporting = LocalContext(ExportConfig(frame=frame, **ONLY_SPLATS), tmp_path / "e", case)
     ExportStage().run(exporting)
     file = tmp_path / "e" / "exports" / "splats.ply"
-    context = imported(tmp_path / "s", file, frame=frame, background=grey)
+    context = imported(tmp_path / "s", file, frame=frame)
     assert context.figures == {"gaussians": 1500, "in_view": 1.0}
     assert not context.warnings
     back = context.result("gaussians")
+    assert back.background == grey
     np.testing.assert_allclose(back.means, case["gaussians"].means, atol=1e-5)
     for camera in scene.ball_cameras():
         before, after = render(case["gaussians"], camera), render(back, camera)
@@ -100,6 +102,17 @@ def test_our_own_export_comes_back_as_it_was(tmp_path: Path, frame: str) -> None
     after_db = psnr(tmp_path / "b", case | {"gaussians": back})
     assert 10 < before_db < 40
     assert after_db == pytest.approx(before_db, abs=0.01)
+
+
+@pytest.mark.parametrize("said", ["", "0.1 0.2", "0.1 0.2 2", "nan 0 0", "red green blue"])
+def test_a_background_that_is_no_colour_is_black(tmp_path: Path, said: str) -> None:
+    file = tmp_path / "peer.ply"
+    write_gaussians_ply(file, scene.ball_gaussians(50), 0, [f"{BACKGROUND} {said}"])
+    assert said_background(file) == (0, 0, 0)
+    write_gaussians_ply(file, scene.ball_gaussians(50), 0, [f"{BACKGROUND} 0.5 0.25 1.0"])
+    assert said_background(file) == (0.5, 0.25, 1)
+    given = imported(tmp_path / "s", file, frame="world", background=(0.0, 0.0, 0.0))
+    assert given.result("gaussians").background == (0, 0, 0)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -31,6 +31,8 @@ UPRIGHT_FROM_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEWERS_PLY = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: What a `.ply` that is turned like that says in a comment of its header.
 TURNED = "dentalsplat turned: 180 degrees about z against colmap/ and transforms.json"
+#: How such a comment begins that says the colour behind the scene, RGB in 0..1.
+BACKGROUND = "dentalsplat background:"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.artifacts.gaussians import Gaussians, write_gaussians_ply
-from pipeline.artifacts.space.frames import TURNED
+from pipeline.artifacts.space.frames import BACKGROUND, TURNED
 from stages.export.orientation import file_from_frame
 from stages.export.scene import Scene
 from stages.export.splatfiles.compressed import compressed_ply_bytes
@@ -42,6 +42,8 @@ def write_splats(
     frame = scene.gaussians
     if stands:
         comments = [*comments, TURNED]
+    if any(frame.background):
+        comments = [*comments, f"{BACKGROUND} {' '.join(map(repr, map(float, frame.background)))}"]
     turned = _turned(frame, FULL, stands)
     degree = used_degree(frame)
     write_gaussians_ply(folder / FULL, turned, degree, comments)
