@@ -110,6 +110,16 @@ def test_table_1_has_the_papers_figures_beside_ours() -> None:
     assert "Alignment: a similarity." in truth["footnotes"]
 
 
+def test_surfaces_have_their_unit() -> None:
+    median = {"median": 0.5}
+    shares = record("ours", geometry={"accuracy": median, "completeness": median})
+    assert grid(built([shares]), "against the truth")["columns"][-2:] == [
+        "accuracy, % of the mesh's diagonal", "completeness, % of the mesh's diagonal",
+    ]  # fmt: skip
+    lengths = record("ours", geometry={"accuracy_mm": median})
+    assert grid(built([lengths]), "against the truth")["columns"][-1] == "accuracy, mm"
+
+
 def test_tables_2_and_3_have_seconds() -> None:
     (quality, *_) = built([record("ours"), record("rival")], "photos")["grids"]
     assert "unseen views" in quality["caption"]  # nothing of the paper's beside these

@@ -190,9 +190,9 @@ TRUTH = {
     ("poses", "auc_5"): "AUC at 5°",
     ("poses", "focal_error_percent"): "focal length error, %",
     ("geometry", "accuracy_mm/median"): "accuracy, mm",
-    ("geometry", "accuracy/median"): "accuracy",
+    ("geometry", "accuracy/median"): "accuracy, % of the mesh's diagonal",
     ("geometry", "completeness_mm/median"): "completeness, mm",
-    ("geometry", "completeness/median"): "completeness",
+    ("geometry", "completeness/median"): "completeness, % of the mesh's diagonal",
     ("geometry", "fscore/0.5"): "F-score at 0.5",
     ("geometry", "fscore/1.0"): "F-score at 1.0",
 }
