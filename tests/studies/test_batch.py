@@ -108,6 +108,10 @@ def test_cases_are_run_once_and_seen_again(run: Any, tmp_path: Path) -> None:
     assert computed(tmp_path) == {"views": 2, "fit": 2, "export": 2}
     run(overrides=["fit.megabytes=1"])
     assert computed(tmp_path) == {"fit": 3}  # what it exports has the same bytes
+    # Pages and tables call a photograph by its name.
+    (tmp_path / "cases" / "a" / "1.jpg").rename(tmp_path / "cases" / "a" / "9.jpg")
+    run(overrides=["fit.megabytes=1"])
+    assert computed(tmp_path)["views"] == 1
 
 
 def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> None:

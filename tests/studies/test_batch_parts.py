@@ -213,7 +213,7 @@ def test_a_picture_is_of_the_photographs_that_were_read(tmp_path: Path) -> None:
         frames, workspace=workspace, stages=["views"],
         overrides={"views.long_side": 128, "report": False},
     )  # fmt: skip
-    contents = [sha256_file(frame) for frame in frames]
+    contents = [f"views: {frame.name} {sha256_file(frame)}" for frame in frames]
     write_thumbnail(workspace, picture, contents[:1], scene=False)
     assert not picture.exists()
     write_thumbnail(workspace, picture, contents, scene=False)

@@ -121,12 +121,18 @@ def _reporter(job: dict[str, Any]) -> Reporter:
 
 
 def _contents(job: dict[str, Any], case: Case, workspace: Path) -> tuple[list[str], str | None]:
-    """Hash of each photograph and of each other file that is read here; and why a photograph
-    can't be read."""
+    """Name and hash of each photograph and of each other file that is read here; and why a
+    photograph can't be read."""
+    from stages.views.find import find_images
+
+    try:
+        photographs = find_images(case.images)
+    except PipelineError as error:
+        return [], str(error)
     found = []
-    for path, _, _ in case.files:
+    for label, path in photographs.items():
         try:
-            found.append(sha256_file(Path(path)))
+            found.append(f"views: {label} {sha256_file(path)}")
         except OSError as error:
             return [], f"{path} can't be read ({error.strerror or error})."
     stages = tuple(job["stages"]) if job["stages"] else None

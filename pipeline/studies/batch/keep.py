@@ -143,6 +143,6 @@ def _photographs(workspace: Path, contents: Collection[str]) -> list[Path]:
     if found is None:
         return []
     read = found.manifest["key_material"]["sources"]
-    if not all({hashed, f"views: {label} {hashed}"} & {*contents} for label, hashed in read):
+    if not all(f"views: {label} {hashed}" in contents for label, hashed in read):
         return []
     return sorted((found.folder / "views" / "images").glob("*.png"))[:1]
