@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path
 
 import cv2
@@ -174,7 +175,8 @@ def write_visit(workspace: Path, visit: Visit) -> Path:
         sh,
     )
     cameras = Cameras(tuple(look.camera for look in visit.looks), scale=Scale("mm", "cameras"))
-    write_result(workspace, "views", [Views(tuple(views))])
+    files = [(view.name, sha256(view.image).hexdigest()) for view in views]
+    write_result(workspace, "views", [Views(tuple(views))], sources=files)
     write_result(workspace, "teeth", [Teeth(tuple(dentitions))])
     write_result(workspace, "init", [cameras])
     write_result(workspace, "fit", [scene])

@@ -66,9 +66,9 @@ def points(count: int) -> Points:
 
 def write_result(
     workspace: Path, stage: str, artifacts: Sequence[Artifact],
-    extra: dict[str, bytes] | None = None, **manifest: Any,
+    extra: dict[str, bytes] | None = None, sources: Sequence[Sequence[str]] = (), **manifest: Any,
 ) -> None:  # fmt: skip
-    """Commit artifacts as the result in use of a stage."""
+    """Commit artifacts as a stage's result in use, made from files of these names and hashes."""
     store = Store(workspace)
     key = f"{stage:0<64}"
     folder = store.begin(stage, key)
@@ -80,8 +80,8 @@ def write_result(
         (folder / name).write_bytes(content)
     kinds = sorted(path.name for path in folder.iterdir() if path.name != "scratch")
     material: dict[str, Any] = {
-        "stage": stage, "version": 1, "config": {}, "seed": 0, "inputs": {}, "sources": [],
-        "libraries": {"numpy": "1.2.3"},
+        "stage": stage, "version": 1, "config": {}, "seed": 0, "inputs": {},
+        "sources": [*map(list, sources)], "libraries": {"numpy": "1.2.3"},
     }  # fmt: skip
     entry = {
         "key_material": material, "config": {"setting": 1}, "seed": 0, "inputs": {}, "reasons": [],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,19 @@ def test_the_command_says_nothing_or_each_step(
 def test_no_workspace_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="not a workspace"):
         run_register(workspaces[0], tmp_path)
+
+
+def test_photographs_of_one_visit_are_not_compared_with_themselves(
+    workspaces: tuple[Path, Path], tmp_path: Path
+) -> None:
+    visit = toy_visit("third", turn=2.0)
+    mixed = replace(visit, looks=(toy_visit("first").looks[0], *visit.looks[1:]))
+    for other, named in ((workspaces[0], "000, 001, 002, 003"), (tmp_path / "mixed", "000")):
+        if other != workspaces[0]:
+            write_visit(other, mixed)
+        with pytest.raises(RequestError, match=f"of {named}, byte for byte.*Name the workspaces"):
+            run_register(workspaces[0], other, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ class Visit:
         gaussians: the scene, in the run's own world; None in tests.
         frame: [4, 4] similarity from that world to this frame.
         covered: FDI number -> [3] middle of a crown with the hardware on it; none without braces.
+        files: hash -> name of each file that its photographs were read from.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Visit:
     gaussians: Gaussians | None = None
     frame: Array = field(default_factory=lambda: np.eye(4))
     covered: Mapping[int, Array] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def scale_doubt(self) -> float:
@@ -139,6 +141,7 @@ def read_visit(workspace: Path) -> Visit:
     """
     from pipeline.studies.report.reading import read_case
     from stages.splatting.rendering import Painter
+    from stages.views.find import MASK_PREFIX
 
     case = read_case(workspace)
     if case.failed is not None:
@@ -183,10 +186,28 @@ def read_visit(workspace: Path) -> Visit:
         middles = {n: np.median(p, axis=0) for n, p in points.items()}
         frame = np.diag([textbook_scale(middles)] * 3 + [1.0])
         percent, source = 100 * TEXTBOOK_DEVIATION, SOURCES["textbook_teeth"]
-    made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians)
+    read_from = case.by_name["views"].manifest["key_material"]["sources"]
+    files = {hashed: name for name, hashed in read_from if not name.startswith(MASK_PREFIX)}
+    made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians, files=files)
     made = made.in_frame(frame)
     made = without_braces(made, pictures)
     return replace(made, scale_percent=percent, scale_source=source)
+
+
+def check_apart(first: Visit, second: Visit) -> None:
+    """Of a photograph that both visits hold it would come out that nothing moved.
+
+    Raises:
+        RequestError: they hold one.
+    """
+    shared = [name for hashed, name in first.files.items() if hashed in second.files]
+    if shared:
+        more = f" and {len(shared) - 4} more" if len(shared) > 4 else ""
+        raise RequestError(
+            f"Both runs are of {', '.join(shared[:4])}{more}, byte for byte, and no photograph is "
+            "of two visits. Name the workspaces of two visits; if a photograph came into the wrong "
+            "folder, take it out and run that visit again."
+        )
 
 
 def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:
