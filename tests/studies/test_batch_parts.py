@@ -123,6 +123,15 @@ def test_a_list_of_cases(tmp_path: Path) -> None:
     assert [Path(path).name for path, _, _ in found[1].files] == ["0.jpg", "1.jpg"]
 
 
+def test_a_list_with_what_a_spreadsheet_leaves(tmp_path: Path) -> None:
+    pictures(tmp_path / "p")
+    text = "\nname;photographs;settings;;\n;;;;\na;p;;;\n\na;p;;;\nb;p;;;x\n"
+    (tmp_path / "list.csv").write_text(text)
+    found = read_cases(tmp_path / "list.csv", Names({}))
+    assert states(found) == {"a": "", "a (line 6)": "wrong", "b": "wrong"}
+    assert "Line 7 has 2 entries too many" in found[2].reason
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
@@ -130,7 +139,7 @@ def test_a_list_of_cases(tmp_path: Path) -> None:
         ("name,photos\na,b\n", "a column 'photos'; .*Did you mean 'photographs'"),
         ("name,photographs\n", "has no cases"),
         ("name,name,photographs\na,b,c\n", "each once"),
-        ('name,photographs\n"a,b\n', "can't be read as CSV"),
+        ('name,photographs\n"a,b\n', r"can't be read as CSV \(line 2: "),
     ],
 )
 def test_a_wrong_list_is_refused(tmp_path: Path, text: str, what: str) -> None:

@@ -36,14 +36,17 @@ def read_cases(path: Path, names: Names) -> list[Case]:
             f"The list of cases {path} is not text in UTF-8 (byte {error.start}). Save it as CSV "
             "in UTF-8."
         ) from error
-    head = text.partition("\n")[0]
+    head = text.lstrip().partition("\n")[0]
     delimiter = max(",\t;", key=head.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
     try:
-        rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True))
+        lines = [(reader.line_num, _without_empty_end(row)) for row in reader]
     except csv.Error as error:
-        raise RequestError(f"The list of cases {path} can't be read as CSV ({error}).") from error
-    rows = [row for row in rows if any(entry.strip() for entry in row)]
-    columns = [entry.strip().lower() for entry in rows[0]] if rows else []
+        raise RequestError(
+            f"The list of cases {path} can't be read as CSV (line {reader.line_num}: {error})."
+        ) from error
+    lines = [(number, row) for number, row in lines if row]
+    columns = [entry.strip().lower() for entry in lines[0][1]] if lines else []
     for column in columns:
         if column not in COLUMNS:
             raise RequestError(
@@ -55,10 +58,10 @@ def read_cases(path: Path, names: Names) -> list[Case]:
             f"The first line of the list of cases {path} must name its columns: "
             f"{', '.join(COLUMNS)} (settings may be left out), each once."
         )
-    if len(rows) == 1:
+    if len(lines) == 1:
         raise RequestError(f"The list of cases {path} has no cases, only the names of its columns.")
     found, given = [], set[str]()
-    for number, row in enumerate(rows[1:], 2):
+    for number, row in lines[1:]:
         case = _case(dict(zip(columns, row, strict=False)), len(row) - len(columns), number, path)
         if case.name in given:
             why = f"The name stands in an earlier line already (line {number} of the list)."
@@ -66,6 +69,12 @@ def read_cases(path: Path, names: Names) -> list[Case]:
         given.add(case.name)
         found.append(Case(**{**vars(case), "id": names.of(case.name)}))
     return found
+
+
+def _without_empty_end(row: list[str]) -> list[str]:
+    """A line without the separators that spreadsheets put where other lines have, or had, more."""
+    used = [place for place, entry in enumerate(row, 1) if entry.strip()]
+    return row[: max(used, default=0)]
 
 
 def _case(row: dict[str, str], excess: int, number: int, path: Path) -> Case:
