@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import traceback
 from collections.abc import Iterable
@@ -24,11 +25,14 @@ def explained(
     """
     if is_disk_full(error, workspace):
         free = shutil.disk_usage(workspace).free / 2**20
+        # a quota, or a limit on the size of a file, ends a run on a disk with room
+        full = f"is full ({free:.1f} MB left)"
+        if isinstance(error, OSError) and error.errno in (errno.EDQUOT, errno.EFBIG):
+            full = f"takes no more from you ({error.strerror})"
         return RequestError(
-            f"The disk that holds the workspace {workspace} is full ({free:.1f} MB left); the "
-            f"stage '{stage}' could not write its result. Nothing computed before is lost: make "
-            "room ('pipeline clean' deletes results that are not in use) and run the same command "
-            "again."
+            f"The disk that holds the workspace {workspace} {full}; the stage '{stage}' "
+            "could not write its result. Nothing computed before is lost: make room ('pipeline "
+            "clean' deletes results that are not in use) and run the same command again."
         )
     if isinstance(error, PipelineError):
         return error

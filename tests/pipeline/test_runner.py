@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import threading
 import time
@@ -14,6 +16,7 @@ from toy import STAGES, ToyEntryPoint, artifact_bytes
 
 import pipeline
 from pipeline.artifacts.views import read_png
+from pipeline.running.failing import explained
 from pipeline.running.reporter import Reporter
 from pipeline.stage import Stage, StageConfig, StageContext
 from pipeline.store import Store
@@ -182,6 +185,20 @@ def test_dry_run_tells_and_does_nothing(run: Any, toys: Path) -> None:
         "read": "cached", "scale": "would run", "count": "unknown", "publish": "unknown"
     }  # fmt: skip
     assert artifact_bytes(toys / "w") == before
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOSPC, r"is full \(\d+\.\d MB left\)"),
+        (errno.EDQUOT, r"takes no more from you \(Disk quota exceeded\)"),
+        (errno.EFBIG, r"takes no more from you \(File too large\)"),
+    ],
+)
+def test_a_quota_is_not_called_a_full_disk(tmp_path: Path, number: int, said: str) -> None:
+    told = explained(OSError(number, os.strerror(number)), "fit", tmp_path)
+    assert isinstance(told, pipeline.RequestError)
+    assert re.search(f"{said}; the stage 'fit' could not .* make room", str(told))
 
 
 @pytest.mark.parametrize(
