@@ -11,7 +11,7 @@ from pipeline.artifacts.views import View, Views
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
-from stages.init.dental.numbering.confidence import Evidence, same_mouth
+from stages.init.dental.numbering.confidence import Evidence, _stranger, same_mouth
 from stages.init.dental.numbering.rivals import Margins
 from stages.init.dental.place import of_several_days, one_sitting
 
@@ -112,3 +112,8 @@ def test_a_sitting_is_some_minutes_and_days_are_several(
     warned = of_several_days(views, ["a.jpg", "b.jpg", "c.jpg"])
     assert len(warned) == (said is False)
     assert said is not False or "a.jpg was taken 12 days after c.jpg" in warned[0]
+
+
+def test_all_that_makes_a_photograph_a_stranger_is_named() -> None:
+    told = _stranger("a.jpg", places_fit=False)
+    assert all(cause in told for cause in ("another patient", "mirrored", "upside down"))

@@ -218,8 +218,8 @@ def _stranger(photo: str, places_fit: bool) -> str:
             "than those of one patient in one light"
         )
     return (
-        f"{photo} may show another patient, or a mirrored picture: its colours and the places of "
-        "its teeth fit the others' badly"
+        f"{photo} may show another patient, or a picture that was mirrored or is upside down: its "
+        "colours and the places of its teeth fit the others' badly"
     )
 
 
