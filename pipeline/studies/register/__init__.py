@@ -30,13 +30,13 @@ def run_register(
         The page, and what moved in a few lines.
 
     Raises:
-        RequestError: a workspace holds no finished run with teeth, both are of one photograph, or
-            the folder can't be written.
+        RequestError: a workspace holds no finished run with teeth, or the folder can't be written.
         ReconstructionError: the visits are of two patients, or share too few teeth.
     """
     from pipeline.measure import peak_mb_with_children
     from pipeline.running.reporter import Reporter
     from pipeline.studies.register.movement import words
+    from pipeline.studies.register.visit import said_of_shared
 
     hears = reporter or Reporter()
     started = time.perf_counter()
@@ -58,7 +58,9 @@ def run_register(
     finally:
         hears.stop()
     lines = [f"{tooth.tooth}: {words(tooth.parts, tooth.half)}" for tooth in moved]
-    return page, "\n".join(lines or ["No tooth moved beyond the uncertainty."])
+    lines = lines or ["No tooth moved beyond the uncertainty."]
+    shared = said_of_shared(found.first, found.second)
+    return page, "\n".join([shared, *lines] if shared else lines)
 
 
 def _registered(
@@ -69,7 +71,7 @@ def _registered(
     from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.register.comparing import compare_visits
     from pipeline.studies.register.page.writing import write_register_page
-    from pipeline.studies.register.visit import check_apart, read_visit
+    from pipeline.studies.register.visit import read_visit
     from pipeline.studies.register.writing import write_files
 
     steps = len(workspaces) + 2
@@ -77,7 +79,6 @@ def _registered(
     for number, workspace in enumerate(workspaces):
         hears.progress(NAME, f"read {workspace}", number, steps)
         visits.append(read_visit(workspace))
-    check_apart(*visits)
     hears.progress(NAME, "compare the teeth", len(visits), steps)
     found = compare_visits(visits[0], visits[1])
     hears.progress(NAME, "write", len(visits) + 1, steps)

@@ -194,20 +194,20 @@ def read_visit(workspace: Path) -> Visit:
     return replace(made, scale_percent=percent, scale_source=source)
 
 
-def check_apart(first: Visit, second: Visit) -> None:
-    """Of a photograph that both visits hold it would come out that nothing moved.
+def said_of_shared(first: Visit, second: Visit) -> str:
+    """What has to be known where both visits hold a file; empty: they don't.
 
-    Raises:
-        RequestError: they hold one.
+    Of such photographs it comes out that nothing moved.
     """
     shared = [name for hashed, name in first.files.items() if hashed in second.files]
-    if shared:
-        more = f" and {len(shared) - 4} more" if len(shared) > 4 else ""
-        raise RequestError(
-            f"Both runs are of {', '.join(shared[:4])}{more}, byte for byte, and no photograph is "
-            "of two visits. Name the workspaces of two visits; if a photograph came into the wrong "
-            "folder, take it out and run that visit again."
-        )
+    if not shared:
+        return ""
+    more = f" and {len(shared) - 4} more" if len(shared) > 4 else ""
+    return (
+        f"Both runs are of {', '.join(shared[:4])}{more}, byte for byte: what these photographs "
+        "show did not move. If one came into the wrong folder, take it out and run that visit "
+        "again."
+    )
 
 
 def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:
