@@ -274,8 +274,12 @@ def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:
     assert (place / "results" / "viewer.html").read_text() == "<p>a scene"
     assert not (place / "fit").exists()
     assert run(keep="results")["a"] == record and computed(tmp_path) == {}
+    assert run(keep="results", overrides=["fit.fail=refused"])["a"]["state"] == "refused"
+    assert (place / "results" / "viewer.html").read_text() == "<p>a scene", "nothing replaces it"
+    (place / "results").rename(place / ".results.before")  # killed while it was run anew
     run(retry=["a"])  # asked for anew, with all of it
-    assert (place / "results" / "splats.ply").is_file() and computed(tmp_path)["views"] == 1
+    assert (place / "results" / "splats.ply").is_file() and computed(tmp_path)["fit"] == 1
+    assert not (place / ".results.before").exists()
 
 
 def test_a_full_disk_ends_the_batch_and_it_goes_on(run: Any, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from pipeline.running.reporter import Reporter
 from pipeline.store import is_disk_full
 from pipeline.store.locks import lock_of
 from pipeline.store.places import is_there, remove, size_of
-from pipeline.studies.batch.keep import clear_kept, keep_results, thumbnail_of, write_thumbnail
+from pipeline.studies.batch.keep import keep_results, kept_aside, thumbnail_of, write_thumbnail
 from pipeline.studies.batch.records import (
     FINAL,
     Case,
@@ -154,12 +154,12 @@ def _outcome(
 ) -> dict[str, Any]:
     """State, reason and figures of a run."""
     overrides = [*job["overrides"], *case.overrides, f"run.threads={job['threads']}"]
-    clear_kept(workspace)
     try:
-        summary = run(
-            case.images, workspace=workspace, preset=job["preset"], overrides=overrides,
-            stages=job["stages"], share=job["share"], reporter=reporter,
-        )  # fmt: skip
+        with kept_aside(workspace):
+            summary = run(
+                case.images, workspace=workspace, preset=job["preset"], overrides=overrides,
+                stages=job["stages"], share=job["share"], reporter=reporter,
+            )  # fmt: skip
     except Exception as error:
         if is_disk_full(error, workspace) or (
             error.__cause__ is not None and is_disk_full(error.__cause__, workspace)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.files import fsync_tree, temporary_beside
@@ -31,8 +31,8 @@ ORDER = (
 THUMBNAIL = 160
 #: Files of a workspace that only runs need; the stages' folders besides.
 _WORKING = (REQUEST, "pages.json", ".lock", "profile")
-#: What is kept while it is made, and when it is whole.
-_MAKING, _MADE = ".results.part", ".results"
+#: What is kept while it is made, when it is whole, and while a new run may replace it.
+_MAKING, _MADE, _BEFORE = ".results.part", ".results", ".results.before"
 
 
 def keep_results(workspace: Path) -> list[str]:
@@ -63,12 +63,24 @@ def keep_results(workspace: Path) -> list[str]:
     return left_out
 
 
-def clear_kept(workspace: Path) -> None:
-    """Before a case is run anew: what an earlier run kept makes room for a link to new results."""
+@contextmanager
+def kept_aside(workspace: Path) -> Iterator[None]:
+    """While a case is run anew: what an earlier run kept makes room for a link to new results.
+
+    It comes back where there are none; after a kill, when the case is run again.
+    """
+    results, before = workspace / "results", workspace / _BEFORE
     for name in (_MAKING, _MADE):
         remove(workspace / name)
-    if is_folder(workspace / "results"):
-        remove(workspace / "results")
+    if is_folder(results):
+        remove(before)
+        results.rename(before)
+    try:
+        yield
+    finally:
+        if is_there(before) and not is_there(results):
+            before.rename(results)
+        remove(before)
 
 
 def _copy_within(results: Path, workspace: Path, into: Path) -> list[str]:
