@@ -125,11 +125,12 @@ def test_a_list_of_cases(tmp_path: Path) -> None:
 
 def test_a_list_with_what_a_spreadsheet_leaves(tmp_path: Path) -> None:
     pictures(tmp_path / "p")
-    text = "\nname;photographs;settings;;\n;;;;\na;p;;;\n\na;p;;;\nb;p;;;x\n"
-    (tmp_path / "list.csv").write_text(text)
-    found = read_cases(tmp_path / "list.csv", Names({}))
-    assert states(found) == {"a": "", "a (line 6)": "wrong", "b": "wrong"}
-    assert "Line 7 has 2 entries too many" in found[2].reason
+    text = "name;photographs;settings;;\n;;;;\na;p;;;\n\na;p;;;\nb;p;;;x\n"
+    for before in ("\n", "sep=;\r\n"):
+        (tmp_path / "list.csv").write_text(before + text, newline="")
+        found = read_cases(tmp_path / "list.csv", Names({}))
+        assert states(found) == {"a": "", "a (line 6)": "wrong", "b": "wrong"}
+        assert "Line 7 has 2 entries too many" in found[2].reason
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 from pipeline.errors import PipelineError, RequestError, nearest
@@ -16,6 +17,8 @@ LISTING = Kind("a list of cases", 1 << 24)
 COLUMNS = ("name", "photographs", "settings")
 #: Between several photographs, or several settings, of a case.
 SEPARATOR = ";"
+#: A first line by which spreadsheets are told what stands between entries.
+SAYS_DELIMITER = re.compile(r"sep=[,;\t]\s*$", re.IGNORECASE)
 
 
 def read_cases(path: Path, names: Names) -> list[Case]:
@@ -38,6 +41,8 @@ def read_cases(path: Path, names: Names) -> list[Case]:
         ) from error
     head = text.lstrip().partition("\n")[0]
     delimiter = max(",\t;", key=head.count)
+    if SAYS_DELIMITER.match(head):  # the line stays, empty, and counts
+        text = text.replace(head, "", 1)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
     try:
         lines = [(reader.line_num, _without_empty_end(row)) for row in reader]
