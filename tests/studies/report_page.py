@@ -41,10 +41,17 @@ onload = async () => {
     slider.value = 20;
     slider.dispatchEvent(new Event("input"));
     result.at = page.querySelector(".compare").style.getPropertyValue("--at");
-    page.querySelector("img.zoom").click();
+    const button = page.querySelector("img.zoom").closest("button");
+    button?.focus();
+    result.focused = page.activeElement === button;
+    page.activeElement.click();
     result.zoomed = page.querySelector("dialog").open;
     const table = page.querySelector("table.sort");
+    const sorting = () => [...table.querySelectorAll("th")].map((head) => head.ariaSort);
+    table.querySelector("th button").click();
+    result.sortings = [sorting()];
     table.querySelectorAll("th button")[1].click();
+    result.sortings.push(sorting());
     result.sorted = [...table.tBodies[0].rows].map((row) => Number(row.cells[1].dataset.v));
   }
   const text = document.createElement("pre");

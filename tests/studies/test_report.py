@@ -222,7 +222,7 @@ def test_a_browser_draws_every_figure_of_a_real_run(sample_run: RunSummary, tmp_
     assert seen["wide"]["images"] > 20
     assert len(seen["wide"]["charts"]) == 6
     assert seen["at"] == "20%"
-    assert seen["zoomed"] is True
+    assert seen["focused"] is True and seen["zoomed"] is True, "the keyboard does it too"
     assert len(seen["sorted"]) >= 3
     shot = tmp_path / "shot.png"
     browse(page, tmp_path, (1200, 1600), f"--screenshot={shot}")
@@ -237,6 +237,9 @@ def test_a_browser_draws_whatever_is_there(tmp_path: Path) -> None:
     seen = look(page, tmp_path)
     assert len(seen["phone"]["charts"]) == 6
     assert seen["sorted"] == sorted(seen["sorted"], reverse=True) or len(seen["sorted"]) == 2
+    by_name, by_figure = seen["sortings"]
+    assert by_name == ["descending", *[None] * (len(by_name) - 1)]
+    assert by_figure[:2] == [None, "descending"], "the column sorted by is told, and it alone"
 
 
 # -- from a run ------------------------------------------------------------------------------------
