@@ -270,6 +270,12 @@ def register_command(
         Path | None,
         typer.Option("-o", "--out", help="Folder of the results.  [default: B/register]"),
     ] = None,
+    live: Annotated[
+        bool,
+        typer.Option(
+            help="Both scenes to turn on the page, or only pictures of them: a small page."
+        ),
+    ] = True,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -278,7 +284,7 @@ def register_command(
     from pipeline.studies.register import run_register
 
     page, said = run_register(
-        first, second, out, reporter=make_reporter(quiet=quiet, verbose=verbose)
+        first, second, out, live=live, reporter=make_reporter(quiet=quiet, verbose=verbose)
     )
     if not quiet:
         size = page.stat().st_size / 1e6

@@ -54,6 +54,19 @@ def written(
         return out, CliRunner().invoke(app, ["register", *map(str, workspaces), "-o", str(out)])
 
 
+def test_a_page_without_live_scenes_is_small_and_has_the_pictures(
+    workspaces: tuple[Path, Path], written: tuple[Path, Result], tmp_path: Path
+) -> None:
+    result = CliRunner().invoke(
+        app, ["register", *map(str, workspaces), "-o", str(tmp_path), "--no-live"]
+    )
+    assert result.exit_code == 0, result.output
+    page, whole = (tmp_path / "register.html"), (written[0] / "register.html")
+    assert page.read_text().count("data:image/jpeg") == whole.read_text().count("data:image/jpeg")
+    assert "splats-0" not in page.read_text() and "Drag to turn" not in page.read_text()
+    assert page.stat().st_size < whole.stat().st_size / 2
+
+
 def test_the_command_writes_table_page_and_mesh(written: tuple[Path, Result]) -> None:
     out, result = written
     assert result.exit_code == 0, result.output

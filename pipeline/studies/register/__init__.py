@@ -16,7 +16,7 @@ NAME = "register"
 
 def run_register(
     first: str | Path, second: str | Path, out: str | Path | None = None, *,
-    reporter: Reporter | None = None,
+    live: bool = True, reporter: Reporter | None = None,
 ) -> tuple[Path, str]:  # fmt: skip
     """Compare two finished runs of one patient; see docs/two_visits.md.
 
@@ -24,6 +24,7 @@ def run_register(
         first, second: workspaces.
         out: folder for register.json, movements.csv, movements.ply and register.html; None: the
             folder `register` in the second workspace.
+        live: whether the page holds both scenes, which are nearly all of its size.
         reporter: hears of the progress.
 
     Returns:
@@ -43,7 +44,7 @@ def run_register(
     hears.start([NAME])
     try:
         hears.stage_started(NAME, [], False)
-        found, page = _registered([Path(first), Path(second)], out, hears)
+        found, page = _registered([Path(first), Path(second)], out, live, hears)
         moved = [tooth for tooth in found.teeth if tooth.certain]
         summary = {
             "teeth": len(found.teeth), "moved": len(moved),
@@ -64,7 +65,7 @@ def run_register(
 
 
 def _registered(
-    workspaces: list[Path], out: str | Path | None, hears: Reporter
+    workspaces: list[Path], out: str | Path | None, live: bool, hears: Reporter
 ) -> tuple[Comparison, Path]:
     """Compare, and write what came of it."""
     from pipeline.errors import RequestError
@@ -89,4 +90,4 @@ def _registered(
             write_files(found, folder)
         except OSError as error:
             raise RequestError(f"{folder} can't be written to ({error.strerror}).") from error
-        return found, write_register_page(found, folder)
+        return found, write_register_page(found, folder, live)

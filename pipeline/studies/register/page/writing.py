@@ -30,14 +30,15 @@ ARROW = 4.0
 TINT = 0.6
 
 
-def write_register_page(found: Comparison, out: Path) -> Path:
-    """Write the page into a folder."""
+def write_register_page(found: Comparison, out: Path, live: bool = True) -> Path:
+    """Write the page into a folder: both scenes to turn if `live`, else pictures alone."""
     certain = [tooth for tooth in found.teeth if tooth.certain]
     return write_page(
         "pipeline.studies.register.page", "register.html", out / PAGE,
         title=f"{found.first.name} and {found.second.name}", found=found, certain=certain,
         table=movement_table(found), scenes=scenes(found),
-        live=live_scenes(found, shown_cameras(found.first)), tinted=tinted(found),
+        live=live_scenes(found, shown_cameras(found.first)) if live else None,
+        tinted=tinted(found),
         shared=said_of_shared(found.first, found.second),
         said=[(t.tooth, words(t.parts, t.half)) for t in certain], farthest=FARTHEST,
         still=", ".join(map(str, found.still)), missing=", ".join(map(str, found.missing)),
