@@ -21,12 +21,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples and tests
 
 from data_samples.mouths import random_mouth
+from pipeline.artifacts.space.scale import Scale
 from stages.export.measuring.landmarks import read_landmarks
 from stages.export.measuring.measures import measure_mouth
 from tests.stages.measured_mouth import photographed, truth
 
 BITES, SHARES = ("normal", "deep", "overjet", "edge"), (0.62, 0.18, 0.12, 0.08)
-MM = {"unit": "mm", "uncertainty_percent": 0.0}
+MM = Scale("mm", "length", 0.0)
 UP = np.array([0.0, 1.0, 0.0])
 
 

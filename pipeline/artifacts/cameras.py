@@ -116,7 +116,7 @@ class Cameras(Artifact):
     @property
     def units(self) -> str:
         """``"mm"`` or ``"arbitrary"``."""
-        return "mm" if self.scale.unit == "mm" else "arbitrary"
+        return self.scale.units
 
     def __len__(self) -> int:
         return len(self.cameras)

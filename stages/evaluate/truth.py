@@ -43,14 +43,14 @@ def read_truth(files: Iterable[Path], views: Sequence[View]) -> Truth:
     Raises:
         RequestError: the files are damaged, or have no camera of at least two of the views.
     """
-    known, units = read_cameras(files, SETTING)
+    known, scale = read_cameras(files, SETTING)
     matched = matching_cameras(known, views, SETTING)
     cameras = {
         view.name: pinhole_camera(view, matched[view.name], SETTING)
         for view in views
         if view.name in matched
     }
-    return Truth(cameras, units)
+    return Truth(cameras, scale.units)
 
 
 def scoring_mask(files: Mapping[str, Path], view: View) -> Mask | None:

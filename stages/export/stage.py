@@ -32,7 +32,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 19
+    version = 20
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")
@@ -203,6 +203,7 @@ def _write_mesh(
 def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Scale) -> int:
     """COLMAP model with its images, `points.ply`, `transforms.json`; returns the points written."""
     from pipeline.artifacts.views import to_uint8
+    from pipeline.untrusted.scenes.transforms import SCALE
     from stages.export import models
     from stages.export.scene import thinned
 
@@ -218,7 +219,7 @@ def _write_cameras(context: StageContext, scene: Scene, folder: Path, scale: Sca
     depths = [view.depth for view in scene.seen]
     count = models.write_colmap(model, scene.cameras, cloud.positions, colors, depths)
     models.write_cloud(folder / "points.ply", cloud.positions, colors)
-    notes: dict[str, Any] = {"dentalsplat_scale": scale.as_dict()}
+    notes: dict[str, Any] = {SCALE: scale.as_dict()}
     if scale.unit == "mm":
         notes["units"] = "mm"
     transforms = models.nerfstudio_transforms(scene.cameras, scene.masked, notes)
@@ -240,7 +241,7 @@ def _write_teeth(
     if not teeth.chosen:
         return None, None
     found = describe_teeth(teeth, views, scene.cameras, scene.seen, frame.name, scale)
-    mouth = read_mouth(teeth, views, scene.cameras, scene.seen, scene.orbit.up, scale.as_dict())
+    mouth = read_mouth(teeth, views, scene.cameras, scene.seen, scene.orbit.up, scale)
     found |= {"measurement_notes": NOTES, "measurements": list(mouth.measurements)}
     write_json(folder / "teeth.json", found)
     (folder / "teeth.csv").write_text(teeth_table(found), encoding="utf-8")

@@ -105,7 +105,7 @@ def describe_teeth(
     return {
         "format": FORMAT,
         "frame": frame,
-        "units": "mm" if scale.unit == "mm" else "arbitrary",
+        "units": scale.units,
         "scale": scale.as_dict(),
         "notes": NOTES,
         "teeth": [_tooth([c for c in crowns if c.number == number]) for number in numbers],

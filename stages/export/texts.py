@@ -159,7 +159,7 @@ def scene_description(
         "scale": scale.as_dict(),
         "frame": {
             **describe_frame(frame),
-            "units": "mm" if scale.unit == "mm" else "arbitrary",
+            "units": scale.units,
             "camera_axes": "OpenCV: x right, y down, z forward (transforms.json: OpenGL)",
             "up": list(up),
             "file_from_frame": {

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.artifacts.space.scale import said_by_cameras
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
@@ -19,13 +19,13 @@ from stages.init.write import save_all
 
 
 def from_model(
-    context: StageContext, views: Views, known: dict[str, KnownCamera], units: str
+    context: StageContext, views: Views, known: dict[str, KnownCamera], scale: Scale
 ) -> None:
     """Write a model's cameras and points, in a normalised world, and no pointmaps.
 
     Args:
         known: name of a view -> its camera in the model.
-        units: of the model's world.
+        scale: of the model's world.
 
     Raises:
         RequestError: a length is to be measured, which takes dense depths.
@@ -53,7 +53,7 @@ def from_model(
         views=tuple(view for view, _ in pairs), cameras=tuple(camera for _, camera in pairs),
         points=sparse.positions,
         seen=tuple(sparse.observed[known[view.name].name] for view, _ in pairs),
-        weights={}, scale=said_by_cameras(units), given=True,
+        weights={}, scale=scale, given=True,
     ).normalised()  # fmt: skip
     cameras = {known[camera.name].name: camera for camera in placement.cameras}
     points = as_points(placement.points, sparse.colors, sparse.observed, cameras)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.space.scale import said_by_cameras
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.graph import Pair
@@ -154,7 +154,7 @@ def _straight(view: View, focal: float, k1: float) -> View:
 
 
 def place_known(
-    views: list[View], known: dict[str, KnownCamera], units: str, ordered: bool,
+    views: list[View], known: dict[str, KnownCamera], scale: Scale, ordered: bool,
     options: ClassicalOptions, *, threads: int, progress: Progress, warn: Warn,
     scratch: Path | None = None,
 ) -> Placement:  # fmt: skip
@@ -164,7 +164,7 @@ def place_known(
 
     Args:
         known: name of a view -> its camera.
-        units: of the world of these cameras.
+        scale: of the world of these cameras.
         scratch: folder for files that are needed meanwhile; None: the system's.
 
     Raises:
@@ -211,7 +211,7 @@ def place_known(
     return Placement(
         views=tuple(placed), cameras=tuple(cameras), points=points, seen=tuple(seen),
         weights={pair: float(len(those)) for pair, those in chosen.items() if len(those)},
-        scale=said_by_cameras(units),
+        scale=scale,
         given=True,
         figures={
             "reprojection_error_px": round(float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), 3),

@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 45
+    version = 46
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -249,26 +249,28 @@ def _classical_options(config: InitConfig) -> ClassicalOptions:
 
 
 def _from_known_cameras(context: StageContext, views: Views) -> None:
+    from pipeline.artifacts.space.scale import said_by_cameras
     from pipeline.geometry.models.known_cameras import matching_cameras, read_cameras
     from stages.init.densify import densify
     from stages.init.dental.read import refuse_mirrored
     from stages.init.place import place_known
 
     config: InitConfig = context.config
-    cameras, units = read_cameras(_camera_files(context.sources), CAMERAS)
+    cameras, scale = read_cameras(_camera_files(context.sources), CAMERAS)
     known = matching_cameras(cameras, views.views, CAMERAS)
     refuse_mirrored(context, views, known)
-    units = units if config.units == "auto" else config.units
+    if config.units not in ("auto", scale.units):
+        scale = said_by_cameras(config.units)
     if config.points == "model":
         from stages.init.model_start import from_model
 
-        from_model(context, views, known, units)
+        from_model(context, views, known, scale)
         return
     if config.method == "dental" or _teeth_are_wide_apart(context, views, known):
         from stages.init.dental.place_known import from_known_teeth
 
         try:
-            from_known_teeth(context, views, known, units)
+            from_known_teeth(context, views, known, scale)
             return
         except ReconstructionError as doubtful:
             if config.method == "dental":
@@ -278,7 +280,7 @@ def _from_known_cameras(context: StageContext, views: Views) -> None:
                 f"is used instead, which knows less of it. {doubtful}"
             )
     placement = place_known(
-        list(views.views), known, units, views.ordered,
+        list(views.views), known, scale, views.ordered,
         _classical_options(config), threads=context.threads, progress=context.progress,
         warn=context.warn, scratch=context.scratch,
     )  # fmt: skip

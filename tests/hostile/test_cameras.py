@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.artifacts.space.scale import NO_SCALE
 from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.stage import LocalContext
@@ -48,6 +49,11 @@ def frame(**values: Any) -> Change:
 
 def common(**values: Any) -> Change:
     return lambda data: data.update(values)
+
+
+def scaled(percent: Any) -> Change:
+    record = {"unit": "mm", "source": "length", "uncertainty_percent": percent}
+    return common(units="mm", dentalsplat_scale=record)
 
 
 def turned(matrix: Any) -> Change:
@@ -122,6 +128,11 @@ FRAME = "frame 1 ('1.jpg')"
         (frame(file_path="a\nb"), "can't be printed"),
         (frame(file_path="x" * 9000), "has a frame 1 whose file_path is"),
         (frame(file_path="0.jpg"), "says file_path '0.jpg' twice, in frames 0 and 1"),
+        (scaled("10 %"), "uncertainty_percent '10 %' in dentalsplat_scale, not a number from 0"),
+        (scaled(-1), "has uncertainty_percent -1 in"),
+        (scaled(True), "has uncertainty_percent True in"),
+        (scaled([2]), "has uncertainty_percent a list in"),
+        (scaled(10**400), "has uncertainty_percent a number of many digits"),
         (common(frames={}), "holds no list 'frames'"),
         (common(frames="none"), "holds no list 'frames'"),
         (common(frames=None), "holds no list 'frames'"),
@@ -183,8 +194,9 @@ def test_what_cameras_may_have_is_kept(tmp_path: Path) -> None:
     )
     data["units"], data["note"] = 3, {"any": ["thing"]}
     (tmp_path / "transforms.json").write_text(json.dumps(data))
-    found, units = read_cameras(model_files(tmp_path).values())
-    assert units == "arbitrary" and [camera.name for camera in found] == ["0.jpg", "1.jpg", "2.jpg"]
+    found, scale = read_cameras(model_files(tmp_path).values())
+    assert scale == NO_SCALE
+    assert [camera.name for camera in found] == ["0.jpg", "1.jpg", "2.jpg"]
     assert found[1].lens.params.tolist() == [600, 590, -50, 240, -0.3, 0, 0, 0]
     assert found[1].lens.model_name == "OPENCV_FISHEYE"
     centre = -np.linalg.inv(found[1].cam_from_world[:3, :3]) @ found[1].cam_from_world[:3, 3]

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pipeline.artifacts.space.scale import NO_SCALE
 from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.geometry.models.model_points import read_model_points
@@ -55,8 +56,8 @@ def refused(folder: Path) -> str:
 def test_a_whole_model_is_read_as_colmap_reads_it(models: Path, name: str) -> None:
     folder = models / name
     truth = pycolmap.Reconstruction(str(folder))
-    found, units = read_cameras(model_files(folder).values())
-    assert units == "arbitrary" and len(found) == len(truth.images) == 12
+    found, scale = read_cameras(model_files(folder).values())
+    assert scale == NO_SCALE and len(found) == len(truth.images) == 12
     by_name = {image.name: image for image in truth.images.values()}
     for camera in found:
         image = by_name[camera.name]

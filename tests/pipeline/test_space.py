@@ -23,7 +23,11 @@ def test_one_sentence_says_it_all() -> None:
         "deviation)."
     )
     assert "no unit" in NO_SCALE.text and NO_SCALE.short == "no scale"
-    assert "not known" in said_by_cameras("mm").text
+    assert said_by_cameras("mm").text == (
+        "Lengths are in millimetres, as the cameras that were given say; how far these may be off "
+        "is not known, and taken to be \u00b15 % (one standard deviation)."
+    )
+    assert (said_by_cameras("mm").counted_percent, NO_SCALE.counted_percent) == (5, 0)
     assert said_by_cameras("arbitrary") == NO_SCALE
     assert Scale("mm", "length", 2.26).short == "mm +-2.3% (length)"
     TEXTBOOK.short.encode("ascii")
@@ -32,7 +36,7 @@ def test_one_sentence_says_it_all() -> None:
 @pytest.mark.parametrize("scale", [NO_SCALE, TEXTBOOK, Scale("mm", "cameras")])
 def test_the_record_comes_back(scale) -> None:
     record = json.loads(json.dumps(scale.as_dict()))
-    assert set(record) == {"unit", "source", "uncertainty_percent", "text"}
+    assert set(record) == {"unit", "source", "uncertainty_percent", "counted_percent", "text"}
     assert Scale.from_dict(record) == scale
     assert Scale.from_dict({**record, "source": "a dream"}).source == "none"
 
@@ -44,7 +48,7 @@ def test_files_from_before_there_was_a_record_load(tmp_path) -> None:
     file.write_text(json.dumps(old))
     found = Cameras.load(tmp_path)
     assert found.scale == Scale("mm") and found.units == "mm" and not found.given
-    assert "not recorded" in found.scale.text
+    assert "no source is recorded" in found.scale.text
     file.write_text(json.dumps({**old, "units": "arbitrary"}))
     assert Cameras.load(tmp_path).scale == NO_SCALE
 

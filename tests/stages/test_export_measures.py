@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from data_samples.mouths import Mouth, random_mouth
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.teeth import filled
 from stages.export.measuring import measures
 from stages.export.measuring.landmarks import read_landmarks
@@ -17,7 +18,7 @@ from stages.export.measuring.measures import measure_mouth, mouth_axes
 from tests.stages.measured_mouth import YAWS, photographed, truth
 from tests.stages.mouth_case import CALM
 
-MM = {"unit": "mm", "uncertainty_percent": 0.0}
+MM = Scale("mm", "length", 0.0)
 UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -95,21 +96,23 @@ def test_an_estimate_needs_no_scale() -> None:
             for key, mark in reading.landmarks.items()
         },
     )
-    none = {"unit": "none", "uncertainty_percent": None}
     here, there = (
         next(e for e in measure_mouth(r, UP, s) if e["name"] == "overbite")
-        for r, s in ((reading, MM), (larger, none))
+        for r, s in ((reading, MM), (larger, NO_SCALE))
     )
     assert there["value"] == pytest.approx(7 * here["value"], rel=1e-3)
     assert there["uncertainty"] == pytest.approx(7 * here["uncertainty"], rel=1e-3)
     assert there["estimated"] == here["estimated"]
     assert there["unit"] == "none"
-    rough = {"unit": "mm", "uncertainty_percent": 15.0}
+    rough = Scale("mm", "textbook_teeth", 15.0)
     sure, worse = measure_mouth(reading, UP, MM), measure_mouth(reading, UP, rough)
     for one, other in zip(sure, worse, strict=True):
         if one["value"] is not None:  # measured or estimated, it holds in 19 of 20 cases
             wider = np.hypot(one["uncertainty"], 1.96 * 0.15 * one["value"])
             assert other["uncertainty"] == pytest.approx(wider, rel=1e-2)
+    # a scale of which nobody says how sure it is is not exact
+    unsaid, five = Scale("mm", "cameras"), Scale("mm", "cameras", 5.0)
+    assert measure_mouth(reading, UP, unsaid) == measure_mouth(reading, UP, five)
 
 
 def test_what_can_not_be_estimated_either_says_why() -> None:

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.models.known_cameras import (
@@ -111,15 +112,31 @@ def test_known_cameras_are_kept_and_the_depth_is_true(tmp_path):
     assert np.median(np.concatenate(errors)) < 0.25  # mm
 
 
+def test_the_scale_of_an_earlier_run_is_taken_over_as_it_was(tmp_path):
+    """With its source and its uncertainty; `init.units` may still say otherwise."""
+    scale = Scale("mm", "textbook_teeth", 10.57)
+    file = tmp_path / "transforms.json"
+
+    def said(**notes):
+        file.write_text(json.dumps({**TRUTH, "units": "mm", **notes}))
+        return read_cameras([file])[1]
+
+    assert said() == said(dentalsplat_scale=NO_SCALE.as_dict()) == Scale("mm", "cameras")
+    assert said(dentalsplat_scale=scale.as_dict(), units="") == NO_SCALE
+    assert said(dentalsplat_scale=scale.as_dict()) == scale
+    for units, kept in (("mm", scale), ("arbitrary", NO_SCALE)):
+        assert run(tmp_path / units, file, units=units).result("cameras").scale == kept
+
+
 def sample_name(frame):
     return f"{TRUTH['frames'].index(frame):03d}"
 
 
 def test_colmap_model_is_found_in_the_usual_folders_and_reads_like_transforms(tmp_path):
     colmap_model(tmp_path / "scene" / "sparse" / "0")
-    found, units = read_cameras(model_files(tmp_path / "scene").values())
+    found, scale = read_cameras(model_files(tmp_path / "scene").values())
     reference, _ = read_cameras(model_files(SAMPLES).values())
-    assert units == "arbitrary"
+    assert scale == NO_SCALE
     assert [c.name for c in found] == [c.name for c in reference]
     for a, b in zip(found, reference, strict=True):
         np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-6)

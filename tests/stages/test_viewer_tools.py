@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import to_uint8
 from stages.export.pictures.orbits import find_orbit
 from stages.export.viewer import page as viewer_page
@@ -21,7 +22,7 @@ from stages.splatting.rendering import render
 from tests.browser import ENGINE, NARROWEST, needs_chromium, run_in
 from tests.stages import export_scene as scene
 
-MM = {"unit": "mm", "source": "length", "uncertainty_percent": 2.0, "text": "A length was given."}
+MM = Scale("mm", "length", 2.0).as_dict()
 #: The ball's world is y-down: the patient's left is +x, up -y, out -z.
 AXES = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 PIXELS = ((70.5, 50.5), (100.5, 66.5), (82.5, 90.5))

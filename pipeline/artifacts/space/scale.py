@@ -14,7 +14,11 @@ _SOURCES: dict[str, str] = {
     "cameras": "as the cameras that were given say",
     "tooth_widths": "from the widths of teeth that were given",
     "textbook_teeth": "from the widths of textbook teeth",
+    "none": "of which no source is recorded",
 }
+#: What counts where nothing says how sure millimetres are, as with cameras of other programs: surer
+#: than textbook teeth (10 %), less so than a length that somebody has measured (1 %).
+UNSAID_PERCENT = 5.0
 
 
 @dataclass(frozen=True)
@@ -39,29 +43,33 @@ class Scale:
         """The sentence that every place shows."""
         if self.unit == "none":
             return "Lengths have no unit: no scale is known, so nothing can be measured in them."
-        if self.source not in _SOURCES:
-            return "Lengths are in millimetres; where their scale comes from is not recorded."
+        said = f"Lengths are in millimetres, {_SOURCES[self.source]}"
         if self.uncertainty_percent is None:
-            return (
-                f"Lengths are in millimetres, {_SOURCES[self.source]}; how far these may be off is "
-                "not known."
-            )
-        return (
-            f"Lengths are in millimetres, {_SOURCES[self.source]}: \u00b1{self.percent} % (one "
-            "standard deviation)."
-        )
+            said += "; how far these may be off is not known, and taken to be"
+        else:
+            said += ":"
+        return f"{said} \u00b1{self.counted_percent:.2g} % (one standard deviation)."
 
     @property
-    def percent(self) -> str:
-        """The uncertainty with two significant digits, for people."""
-        return "unknown" if self.uncertainty_percent is None else f"{self.uncertainty_percent:.2g}"
+    def units(self) -> str:
+        """``"mm"`` or ``"arbitrary"``."""
+        return "mm" if self.unit == "mm" else "arbitrary"
+
+    @property
+    def counted_percent(self) -> float:
+        """The uncertainty as it counts in what is measured: `UNSAID_PERCENT` where it is not
+        known, none where there is no unit."""
+        if self.unit == "none":
+            return 0.0
+        return UNSAID_PERCENT if self.uncertainty_percent is None else self.uncertainty_percent
 
     @property
     def short(self) -> str:
         """A few ASCII letters for headers of files: ``mm +-15% (textbook_teeth)``."""
         if self.unit == "none":
             return "no scale"
-        sure = "" if self.uncertainty_percent is None else f" +-{self.percent}%"
+        percent = self.uncertainty_percent
+        sure = "" if percent is None else f" +-{percent:.2g}%"
         return f"mm{sure} ({self.source})"
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,6 +78,7 @@ class Scale:
             "unit": self.unit,
             "source": self.source,
             "uncertainty_percent": self.uncertainty_percent,
+            "counted_percent": self.counted_percent,
             "text": self.text,
         }
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.space.scale import NO_SCALE, Scale
 from pipeline.artifacts.views import View, to_uint8
 from pipeline.errors import RequestError
 from pipeline.geometry.models.colmap import quiet_pycolmap
@@ -78,7 +79,7 @@ def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
     )
 
 
-def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[KnownCamera], str]:
+def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[KnownCamera], Scale]:
     """Read what `model_files` found.
 
     Args:
@@ -86,8 +87,7 @@ def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[Kn
         setting: name of the setting that gave them, for messages.
 
     Returns:
-        The posed images sorted by name, and the units (``"mm"`` where the file says so, else
-        ``"arbitrary"``).
+        The posed images sorted by name, and the scale of their world as the file says it.
 
     Raises:
         RequestError: the files are damaged, or hold no posed image.
@@ -96,7 +96,7 @@ def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[Kn
     is_list = files[0].suffix.lower() == ".json"
     source = files[0] if is_list else files[0].parent
     try:
-        posed, units = read_transforms(source) if is_list else (_posed(source), "")
+        posed, scale = read_transforms(source) if is_list else (_posed(source), NO_SCALE)
     except UnusableFile as error:
         raise RequestError(
             f"{setting}: {source} {error}. Is it whole? Give the cameras as the program that "
@@ -105,8 +105,7 @@ def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[Kn
     if not posed:
         raise RequestError(f"{setting}: {source} holds no posed image.")
     cameras = [KnownCamera(one.name, _lens(one.lens), one.cam_from_world) for one in posed]
-    units = "mm" if units == "mm" else "arbitrary"
-    return sorted(cameras, key=lambda camera: camera.name), units
+    return sorted(cameras, key=lambda camera: camera.name), scale
 
 
 def _posed(folder: Path) -> list[PosedLens]:

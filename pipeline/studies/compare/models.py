@@ -99,8 +99,8 @@ def read_truth(path: Path, views: Sequence[View]) -> tuple[dict[str, Camera], st
         RequestError: the file can't be read, or fewer than two views have a camera there.
     """
     setting = "--ground-truth"
-    cameras, units = read_cameras(model_files(path, setting).values(), setting)
+    cameras, scale = read_cameras(model_files(path, setting).values(), setting)
     known = matching_cameras(cameras, views, setting)
     return {
         v.name: pinhole_camera(v, known[v.name], setting) for v in views if v.name in known
-    }, units
+    }, scale.units

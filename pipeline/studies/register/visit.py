@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.sizes import millimetres_per_unit
 from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
 from pipeline.geometry.similarity import moved_camera
 from pipeline.studies.register.hardware import braces_in, painted_over
@@ -28,9 +29,6 @@ LEAST_ALPHA = 0.5
 LEAST_PIXELS = 40
 #: Share of a tooth's points, by depth, that may be off: what outlines take in beside the tooth.
 TRIMMED = 0.04
-#: Cameras given in millimetres don't say how sure they are: surer than textbook teeth (10 %), less
-#: so than a length that somebody has measured (1 %).
-UNSAID_PERCENT = 5.0
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artifacts.space.scale import NO_SCALE, Scale, said_by_cameras
 from pipeline.untrusted.files import CAMERA_LIST, UnusableFile
 from pipeline.untrusted.plain_json import read_plain_json
 from pipeline.untrusted.scenes.cameras import (
@@ -25,10 +26,13 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _FISHEYE = ("FISHEYE", "OPENCV_FISHEYE")
 _STRAIGHT = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 _LONGEST_NAME = 4096
+#: What our own files say of their millimetres beside the units: a record as `Scale.as_dict` has it.
+SCALE = "dentalsplat_scale"
+_MOST_PERCENT = 1000
 
 
-def read_transforms(path: Path) -> tuple[list[PosedLens], str]:
-    """The cameras of a `transforms.json`, in its order, and its units (what `units` says, or "").
+def read_transforms(path: Path) -> tuple[list[PosedLens], Scale]:
+    """The cameras of a `transforms.json`, in its order, and the scale of their world.
 
     Raises:
         UnusableFile: it can't be read, or says what no camera has; the message names the frame and
@@ -48,8 +52,24 @@ def read_transforms(path: Path) -> tuple[list[PosedLens], str]:
                 f"{number}"
             )
         first[camera.name] = number
-    units = data.get("units", "")
-    return cameras, units if isinstance(units, str) else ""
+    return cameras, _scale(data)
+
+
+def _scale(data: Mapping[str, Any]) -> Scale:
+    """Millimetres where `units` says so, and what our own files hold beside (`SCALE`)."""
+    record = data.get(SCALE)
+    if data.get("units") != "mm":
+        return NO_SCALE
+    if not isinstance(record, dict) or record.get("unit") != "mm":
+        return said_by_cameras("mm")
+    percent = record.get("uncertainty_percent")
+    number = isinstance(percent, int | float) and not isinstance(percent, bool)
+    if percent is not None and not (number and 0 <= percent <= _MOST_PERCENT):
+        raise UnusableFile(
+            f"has uncertainty_percent {_shown(percent)} in {SCALE}, not a number from 0 to "
+            f"{_MOST_PERCENT}"
+        )
+    return Scale.from_dict(record)
 
 
 def _camera(frame: object, common: Mapping[str, Any], where: str) -> PosedLens:

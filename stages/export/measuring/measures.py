@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.artifacts.dental.fdi import is_left, is_upper, other_side
+from pipeline.artifacts.space.scale import Scale
 from stages.export.measuring.covered_bite import (
     BECAUSE,
     METHOD,
@@ -46,7 +47,7 @@ _FLAT = 0.12
 
 NOTES = {
     "value": "in the units of scale; null: see not_visible",
-    "uncertainty": "holds in 19 of 20 cases, that of the scale included where it is known",
+    "uncertainty": "holds in 19 of 20 cases, that of the scale (its counted_percent) included",
     "sure": "sure, fair or unsure: the uncertainty beside the size of a tooth, and the doubt",
     "doubt": "0..1, that a tooth it is measured at has another number",
     "estimated": "null: it is measured; else why it can't be, and the share of the covered crowns "
@@ -82,15 +83,13 @@ class Rule:
     estimate: Callable[[Reading, float], CoveredBite | str] = lambda reading, most_doubt: ""
 
 
-def measure_mouth(
-    reading: Reading, up: Array, scale: Mapping[str, Any], seed: int = 0
-) -> list[dict[str, Any]]:
+def measure_mouth(reading: Reading, up: Array, scale: Scale, seed: int = 0) -> list[dict[str, Any]]:
     """All measurements of a mouth, those that can't be made with the reason.
 
     Args:
         reading: the landmarks.
         up: [3] up in the photographs, for rows that have no plane of their own.
-        scale: ``unit`` (``mm`` or ``none``) and ``uncertainty_percent`` (or None) of the lengths.
+        scale: of the lengths.
         seed: of the random draws.
 
     Returns:
@@ -111,9 +110,9 @@ def measure_mouth(
     for rule in RULES:
         teeth, missing = _teeth_of(rule, reading, axes)
         bite = rule.estimate(reading, MOST_DOUBT) if missing and axes is not None else ""
-        entry = {
+        entry: dict[str, Any] = {
             "name": rule.name, "title": rule.title, "method": rule.method, "value": None,
-            "uncertainty": None, "unit": scale["unit"], "sure": None, "doubt": None,
+            "uncertainty": None, "unit": scale.unit, "sure": None, "doubt": None,
             "direction": "", "teeth": sorted(teeth), "points": None, "estimated": None,
             "not_visible": missing,
         }  # fmt: skip
@@ -134,15 +133,14 @@ def measure_mouth(
 
 def _measured(
     rule: Rule, teeth: set[int], covered: bool, places: Places, axes: Array,
-    draws: Sequence[tuple[Places, Array]], scale: Mapping[str, Any],
+    draws: Sequence[tuple[Places, Array]], scale: Scale,
 ) -> dict[str, Any]:  # fmt: skip
     """A value that is measured, and how far it may be off."""
     value, points = rule.measure(places_of(places, teeth), axes)
     values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
     share = rule.stands_for * (rule.covered if covered else 1.0)
-    percent = scale.get("uncertainty_percent") or 0.0
     spacing = spacing_of(places)
-    off = [float(np.std(values)), share * spacing, value * percent / 100]
+    off = [float(np.std(values)), share * spacing, value * scale.counted_percent / 100]
     return {
         "value": _rounded(value),
         "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),
@@ -153,15 +151,19 @@ def _measured(
 
 def _estimated(
     rule: Rule, bite: CoveredBite, places: Places, axes: Array,
-    draws: Sequence[tuple[Places, Array]], scale: Mapping[str, Any],
+    draws: Sequence[tuple[Places, Array]], scale: Scale,
 ) -> dict[str, Any]:  # fmt: skip
     """The same of one that is estimated: an edge that is covered is not below what covers it."""
     height, seen = bite.heights(places, axes)
     value = min(max(height - seen, 0.0), height)
     heights, seens = np.array([bite.heights(draw, turned) for draw, turned in draws]).T
     stands_for = rule.stands_for * spacing_of(places)
-    percent = scale.get("uncertainty_percent") or 0.0
-    off = [np.std(heights - seens), stands_for, SPREAD * height, value * percent / 100]
+    off = [
+        np.std(heights - seens),
+        stands_for,
+        SPREAD * height,
+        value * scale.counted_percent / 100,
+    ]
     share_off = [np.std(seens / heights), stands_for / height, SPREAD * seen / height]
     return {
         "method": METHOD,

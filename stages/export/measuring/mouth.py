@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from stages.dentition.working import outline_in_view
@@ -46,7 +47,7 @@ def read_mouth(
     cameras: Sequence[Camera],
     seen: Sequence[RenderedView],
     up: Array,
-    scale: Mapping[str, Any],
+    scale: Scale,
 ) -> Mouth:
     """Measure a mouth.
 

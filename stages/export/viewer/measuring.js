@@ -14,7 +14,7 @@ function distanceOf([a, b], scale) {
   const value = Math.hypot(...minus(b.point, a.point));
   const towards = unit(minus(b.point, a.point));
   const variance = varianceAlong(a, towards) + varianceAlong(b, towards);
-  const ofScale = value * (scale.uncertainty_percent ?? 0) / 100;
+  const ofScale = value * scale.counted_percent / 100;
   return { value, off: WIDE * Math.hypot(Math.sqrt(variance), ofScale) };
 }
 
@@ -42,8 +42,7 @@ function lengthText(value, off, scale) {
     const digits = clamp(2 - Math.floor(Math.log10(Math.max(off, 1e-6)) + 1), 0, 6);
     return `${value.toFixed(digits)} ± ${off.toFixed(digits)} (no scale)`;
   }
-  const unsaid = scale.uncertainty_percent === null ? " and the scale's" : "";
-  return `${value.toFixed(1)} ± ${Math.max(off, 0.1).toFixed(1)} mm${unsaid}`;
+  return `${value.toFixed(1)} ± ${Math.max(off, 0.1).toFixed(1)} mm`;
 }
 
 /** What was measured by itself, for people: overjet and overbite have a sign, the others a side. */

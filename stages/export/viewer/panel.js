@@ -107,8 +107,7 @@ function addPanel(viewer, tools) {
   }
   byId("automatic").hidden = !scene.measurements.length;
   byId("measured").append(...scene.measurements.map((entry) => measurementRow(tools, entry)));
-  byId("scale").textContent = scene.scale.uncertainty_percent === null || scene.scale.unit !== "mm"
-    ? scene.scale.text : `${scene.scale.text} (± ${scene.scale.uncertainty_percent} %)`;
+  byId("scale").textContent = scene.scale.text;
 
   const update = (now, before) => {
     for (const tool of CHOICES.tool.slice(1)) {

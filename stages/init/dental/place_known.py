@@ -13,7 +13,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED, MEASURED
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.points import Points
-from pipeline.artifacts.space.scale import said_by_cameras
+from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Dentition, moved_polygons
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
@@ -74,13 +74,13 @@ GUESS = float(np.log((FILLED + MEASURED) / 2 - 1))
 
 
 def from_known_teeth(
-    context: StageContext, views: Views, known: dict[str, KnownCamera], units: str
+    context: StageContext, views: Views, known: dict[str, KnownCamera], scale: Scale
 ) -> None:
     """Make the surface of the teeth in front of known cameras, and write what came out.
 
     Args:
         known: name of a view -> its camera; views without one are left out.
-        units: of the world of these cameras.
+        scale: of the world of these cameras.
 
     Raises:
         ReconstructionError: no teeth, or they are doubtful, or don't fit the cameras.
@@ -105,7 +105,7 @@ def from_known_teeth(
         context.warn(f"The model has no camera of {', '.join(left_out)}; left out.")
     _write(context, views, teeth, held.centred, Placement(
         views=tuple(placed), cameras=tuple(cameras), points=np.zeros((0, 3)), seen=(), weights={},
-        scale=said_by_cameras(units), given=True,
+        scale=scale, given=True,
     ))  # fmt: skip
 
 
