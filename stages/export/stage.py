@@ -58,7 +58,7 @@ class ExportStage(Stage):
 
     def run(self, context: StageContext) -> None:
         from pipeline.artifacts.space.frames import frame_of
-        from pipeline.artifacts.space.scale import NO_SCALE
+        from pipeline.artifacts.space.scale import Scale
         from stages.export.beside import Beside
         from stages.export.mesh.building import raw_surface
         from stages.export.scene import assemble
@@ -73,7 +73,9 @@ class ExportStage(Stage):
         frame = frame_of(cameras, config.frame)
         if frame.lacking:
             context.warn(frame.lacking)
-        scale = NO_SCALE if frame.name == "world" else cameras.scale
+        scale = cameras.scale
+        if frame.name == "world":
+            scale = Scale("none", scale.source)
         comments = [f"dentalsplat: {scale.text}"]
         scene = assemble(
             views,

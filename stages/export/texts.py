@@ -108,7 +108,7 @@ FRAMES: dict[str, tuple[str, str, str]] = {
     "world": (
         "the reconstruction's own: x right, y down, z away from the viewer",
         "the middle of what the photographs show",
-        "All files are in the reconstruction's own frame; its scale is arbitrary.",
+        "All files are in the reconstruction's own frame, and in its own units.",
     ),
 }
 TURNED = """\

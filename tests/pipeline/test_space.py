@@ -31,9 +31,14 @@ def test_one_sentence_says_it_all() -> None:
     assert said_by_cameras("arbitrary") == NO_SCALE
     assert Scale("mm", "length", 2.26).short == "mm +-2.3% (length)"
     TEXTBOOK.short.encode("ascii")
+    aside = Scale("none", "length")
+    assert "own units" in aside.text and "in the other frames they are in mill" in aside.text
+    assert (aside.short, aside.units, aside.counted_percent) == ("no scale", "arbitrary", 0)
 
 
-@pytest.mark.parametrize("scale", [NO_SCALE, TEXTBOOK, Scale("mm", "cameras")])
+@pytest.mark.parametrize(
+    "scale", [NO_SCALE, TEXTBOOK, Scale("mm", "cameras"), Scale("none", "length")]
+)
 def test_the_record_comes_back(scale) -> None:
     record = json.loads(json.dumps(scale.as_dict()))
     assert set(record) == {"unit", "source", "uncertainty_percent", "counted_percent", "text"}

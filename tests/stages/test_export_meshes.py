@@ -389,6 +389,22 @@ def test_without_a_scale_no_model_is_made_and_why_is_said(tmp_path: Path) -> Non
     assert "model" in description["skipped"]
 
 
+def test_in_our_own_frame_the_units_are_our_own_though_millimetres_are_known(
+    tmp_path: Path,
+) -> None:
+    context = export(
+        tmp_path, Scale("mm", "length", 2.0), frame="world", mesh_base=True, mesh_texture=0
+    )
+    (told,) = context.warnings
+    home = tmp_path / "exports"
+    scene = json.loads((home / "scene.json").read_text())
+    assert scene["scale"]["unit"] == "none" and scene["scale"]["source"] == "length"
+    np.testing.assert_array_equal(scene["frame"]["frame_from_world"], np.eye(4))
+    assert "export.frame=world" in scene["skipped"]["model"]
+    for text in (told, scene["scale"]["text"], (home / "README.txt").read_text()):
+        assert "own units" in text and "no scale is known" not in text
+
+
 def test_a_repaired_surface_has_two_sides() -> None:
     """Some faces look inward, as closed holes and simplification leave them."""
     flat = sheet(20, 20, lambda u, v: (u, v, 0 * u), lambda u, v: (u, v, 0 * u))

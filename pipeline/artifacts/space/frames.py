@@ -23,7 +23,8 @@ WANTED = (
     "auto (input where cameras were given, else mouth where its teeth say how it lies, else "
     "upright), mouth (x to the patient's left, y up, z to the front, origin between the upper "
     "central incisors' edges), upright (x right, y up, z towards the photographs), input (that of "
-    "given cameras, where there are some) or world (the reconstruction's own)"
+    "given cameras, where there are some) or world (the reconstruction's own, in "
+    "its own units, never millimetres)"
 )
 #: Our world has y down and z ahead (`pipeline.geometry.world.normalising_similarity`).
 UPRIGHT_FROM_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -69,7 +70,8 @@ class Frame:
 def frame_of(cameras: Cameras, wanted: Wanted = "auto") -> Frame:
     """The frame that a setting asks for, of a scene with these cameras.
 
-    In millimetres where they are known; else in the units of given cameras; else in our world's.
+    In millimetres where they are known; else in the units of given cameras; else in our world's, as
+    the frame ``world`` always is.
     """
     return replace(_frame_of(cameras, wanted), mouth_from_world=cameras.mouth_from_world)
 

@@ -26,7 +26,8 @@ class Scale:
     """The scale of a scene.
 
     Attributes:
-        unit: ``mm``, or ``none``: nothing can be measured.
+        unit: ``mm``, or ``none``: nothing can be measured. With a source it is known what a
+            millimetre is, but the frame of the exports is in other units.
         source: a given length (`init.length`), cameras whose file says millimetres, widths of
             teeth that the user gave, those of textbook teeth, or none that is known.
         uncertainty_percent: one standard deviation of all lengths together, in percent of them;
@@ -41,6 +42,11 @@ class Scale:
     @property
     def text(self) -> str:
         """The sentence that every place shows."""
+        if self.put_aside:
+            return (
+                "Lengths are in the reconstruction's own units, as the frame 'world' has them, so "
+                "nothing can be measured in them; in the other frames they are in millimetres."
+            )
         if self.unit == "none":
             return "Lengths have no unit: no scale is known, so nothing can be measured in them."
         said = f"Lengths are in millimetres, {_SOURCES[self.source]}"
@@ -49,6 +55,11 @@ class Scale:
         else:
             said += ":"
         return f"{said} \u00b1{self.counted_percent:.2g} % (one standard deviation)."
+
+    @property
+    def put_aside(self) -> bool:
+        """Is a scale known that these lengths do not have?"""
+        return self.unit == "none" and self.source != "none"
 
     @property
     def units(self) -> str:

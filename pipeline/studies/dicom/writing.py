@@ -105,9 +105,14 @@ def _solids(
     for path in sorted(results.glob("*.stl")):
         measured = scale.unit == "mm" and "without_scale" not in path.name
         if not measured and not unscaled:
+            why = (
+                "it is in the reconstruction's own units"
+                if scale.put_aside
+                else "its scale is not known"
+            )
             left_out[path.name] = (
-                "its scale is not known, and a program would take its lengths for millimetres; "
-                "--unscaled writes it all the same"
+                f"{why}, and a program would take its lengths for millimetres; --unscaled writes "
+                "it all the same"
             )
             continue
         modified = path.stem.startswith(_MODIFIED)

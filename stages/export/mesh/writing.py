@@ -99,6 +99,11 @@ def write_models(
     Returns:
         Why there is none; empty: there is one of each jaw.
     """
+    if writer.scale.put_aside:
+        return (
+            "export.frame=world has the reconstruction's own units, and a base is so many "
+            "millimetres high"
+        )
     if writer.scale.unit != "mm":
         return "no scale is known, so nobody can say how high a base is"
     if not jaws:
