@@ -28,7 +28,12 @@ class ExportConfig(StageConfig):
         description="tsdf: fuse depth rendered from the Gaussians; poisson: surface through the "
         "points",
     )
-    mesh_faces: int = Field(60_000, ge=100, le=5_000_000, description="triangles, at most")
+    mesh_faces: int = Field(
+        60_000,
+        ge=100,
+        le=5_000_000,
+        description="triangles of the mesh, at most, and of each closed model that stays closed so",
+    )
     mesh_resolution: int = Field(
         256, ge=32, le=1024, description="voxels across what a photograph shows"
     )

@@ -18,6 +18,7 @@ from pipeline.artifacts.teeth import Teeth
 from pipeline.stage import LocalContext
 from stages.dentition.crowns import Outline, dentition_of
 from stages.export.mesh.bend import bent
+from stages.export.mesh.building import clean_mesh
 from stages.export.mesh.jaws import LOWER, NEITHER, UPPER, jaws_at, jaws_of
 from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.solid import (
@@ -29,7 +30,14 @@ from stages.export.mesh.solid import (
     is_closed,
     well_composed,
 )
-from stages.export.mesh.surface import Mesh, face_normals, repair, turned_faces, vertex_normals
+from stages.export.mesh.surface import (
+    Mesh,
+    face_normals,
+    keep_vertices,
+    repair,
+    turned_faces,
+    vertex_normals,
+)
 from stages.export.mesh.texture.atlas import packed, textured
 from stages.export.mesh.texture.glb import write_glb
 from stages.export.mesh.texture.levelling import levelled
@@ -403,6 +411,20 @@ def test_in_our_own_frame_the_units_are_our_own_though_millimetres_are_known(
     assert "export.frame=world" in scene["skipped"]["model"]
     for text in (told, scene["scale"]["text"], (home / "README.txt").read_text()):
         assert "own units" in text and "no scale is known" not in text
+
+
+@pytest.mark.parametrize("most", [100, 300, 1000])
+def test_a_mesh_has_no_more_triangles_than_asked_whatever_its_rims_have(most: int) -> None:
+    wave = sheet(300, 60, lambda u, v: (60 * u, 12 * v, np.sin(20 * u)), lambda u, v: (u, v, 0 * u))
+    holes = np.stack(np.meshgrid(np.arange(4, 60, 8), [3, 9], [0]), -1).reshape(-1, 3)
+    away, _ = cKDTree(holes).query(wave.vertices * (1, 1, 0))
+    ragged = keep_vertices(wave, away > 1.2)
+    mesh = clean_mesh(ragged, most)
+    assert mesh is not None and 0.9 * most < len(mesh) <= most
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    spots, _ = trimesh.sample.sample_surface(solid, 20_000, seed=0)
+    off, _ = cKDTree(spots).query(ragged.vertices)
+    assert off.mean() < (0.3 if most == 100 else 0.12), "the surface is still there"
 
 
 def test_a_repaired_surface_has_two_sides() -> None:

@@ -14,7 +14,7 @@ from pipeline.artifacts.views import to_uint8
 from stages.export.mesh.bend import bent
 from stages.export.mesh.field import TRUNCATION, colors_of, fuse
 from stages.export.mesh.nets import zero_surface
-from stages.export.mesh.rims import even_rims
+from stages.export.mesh.rims import even_rims, rim_edges
 from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,
@@ -88,12 +88,18 @@ def raw_surface(
 
 def clean_mesh(surface: Mesh, most_faces: int) -> Mesh | None:
     """A surface without loose parts and holes, of at most so many triangles, with even rims; None
-    if too little is left."""
+    if too little is left.
+
+    Rims that would take most of the triangles are simplified with the rest, and have no steps then.
+    """
     surface = drop_small_parts(surface, SMALLEST_PART)
     if len(surface) < FEWEST_FACES:
         return None
-    surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE), SMALLEST_PART)
-    return even_rims(surface) if len(surface) >= FEWEST_FACES else None
+    rims_stay = 2 * len(rim_edges(surface.faces)) <= most_faces
+    surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE, rims_stay), SMALLEST_PART)
+    if len(surface) < min(FEWEST_FACES, most_faces / 2):
+        return None
+    return even_rims(surface) if rims_stay else surface
 
 
 def fused(

@@ -126,12 +126,13 @@ def drop_small_parts(mesh: Mesh, least_share: float) -> Mesh:
     return keep_vertices(mesh, faces[part] >= least_share * faces.max())
 
 
-def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
+def repair(mesh: Mesh, target_faces: int, largest_hole: int, rims_stay: bool = True) -> Mesh:
     """Repair a mesh and simplify it to at most about `target_faces` (quadric edge collapse).
 
     Removes duplicate and null faces and non-manifold edges and vertices, and closes holes of up to
     `largest_hole` edges (0: none, and faces stay turned as they are). Colours are taken over from
-    the nearest original vertices.
+    the nearest original vertices. Where `rims_stay` there are at least as many faces as edges of
+    rims, whatever is asked for.
     """
     import pymeshlab
 
@@ -150,12 +151,13 @@ def repair(mesh: Mesh, target_faces: int, largest_hole: int) -> Mesh:
     work.meshing_close_holes(maxholesize=largest_hole, newfaceselected=False)
     if work.current_mesh().face_number() > target_faces:
         work.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=target_faces, preserveboundary=True, boundaryweight=2.0,
+            targetfacenum=target_faces, preserveboundary=rims_stay, boundaryweight=2.0,
             preservenormal=True, preservetopology=True, planarquadric=True, qualitythr=0.5,
         )  # fmt: skip
         _make_manifold(work)
     if largest_hole:
-        _turn_one_way(work, largest_hole)
+        # around simpler rims, gaps that are meant have as few edges as holes
+        _turn_one_way(work, largest_hole if rims_stay else 0)
     work.meshing_remove_unreferenced_vertices()
     result = work.current_mesh()
     vertices = np.array(result.vertex_matrix(), np.float64)
