@@ -250,6 +250,62 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path, corner: tuple[
     assert probed(workspace, tmp_path / "browser", READ) == {"yaml": result["yaml"]}
 
 
+FOCUS = """
+  const at = () => {
+    const active = document.activeElement;
+    const where = active.closest("article")?.getAttribute("aria-label") ?? active.parentElement.id;
+    const what = active === document.body ? "nothing" : active.ariaLabel ?? active.textContent;
+    return `${what} in ${where}`;
+  };
+  const hit = (button) => { button.focus(); button.click(); };
+  const head = (k, text) => all(".head button", card(k))
+    .find((entry) => entry.textContent === text);
+  hit(chip(0, "12")); press("Escape");
+  result.escape = at();
+  hit(chip(0, "12")); hit(document.querySelector("#panel .close"));
+  result.close = at();
+  hit(chip(0, "12"));
+  document.querySelector("#panel input").focus(); press("Escape");
+  result.field = at();
+  hit(chip(1, "21"));
+  head(0, "Mirror image").focus(); head(0, "Mirror image").click();
+  result.mirror = at();
+  const kind = card(0).querySelector("select");
+  kind.focus(); kind.value = "left"; kind.dispatchEvent(new Event("change"));
+  result.kind = at().split(" in ")[1];
+  hit(document.getElementById("undo")); hit(document.getElementById("undo"));
+  result.undo = at();
+  head(1, "All numbers are right").focus(); hit(head(1, "All numbers are right"));
+  result.sure = at();
+  hit(head(0, "Leave out"));
+  result.left = [at(), all("article").length];
+  document.activeElement.click();
+  result.back = [at(), all("article").length];
+  hit(all("#aside button")[0]);
+  result.used = [at(), all("article").length];
+  hit(chip(0, "12")); press("z", { ctrlKey: true });
+  result.keys = at();
+  document.getElementById("undo").focus();
+  for (let k = 0; k < 9; k++) document.activeElement.click();
+  result.all = [at(), all("article").length];
+"""
+
+
+@needs_chromium
+def test_the_focus_stays_where_one_works(tmp_path: Path) -> None:
+    result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", FOCUS)
+    chip = "upper row, 2 of 6: 12, upper right lateral incisor in 0_right.jpg"
+    assert [result[how] for how in ("escape", "close", "field")] == [chip] * 3
+    assert result["mirror"] == "Mirror image in 0_right.jpg"
+    assert result["kind"] == "0_right.jpg"
+    assert result["undo"] == result["sure"] == "Undo in "
+    assert result["left"] == ["Undo in ", 1], "what was pressed is gone: what brings it back"
+    assert result["back"] == ["Undo in ", 2]
+    assert result["used"] == ["Undo in ", 3]
+    assert result["keys"].startswith("upper row, 4 of 6: 21"), "where what was undone stands"
+    assert result["all"] == ["Undo in ", 2]
+
+
 #: The first photograph shows four teeth of a jaw in its left half; of the second, init has found
 #: that it is a mirror image.
 TAKEN = ((14, 13, 12, 11), (44, 43, 42, 41))

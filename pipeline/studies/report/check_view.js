@@ -221,9 +221,11 @@ const drawChosen = (panel, photo, crown) => {
         title: "Give its neighbours the numbers that follow, to both ends of the row" },
       "Number the row from here") : null));
 };
+let shown = null; // what was chosen when the page was last drawn
 const draw = () => {
   const active = document.activeElement;
-  const wasInput = active?.closest?.("#panel") && active.matches("input");
+  const atCrown = active === document.body || active.closest(".chip, #panel");
+  const writing = active.matches("#panel input");
   const panel = find("panel");
   const used = photos.filter(isUsed);
   const holder = find("photographs");
@@ -236,17 +238,21 @@ const draw = () => {
   panel.classList.toggle("rest", !crown);
   if (crown) drawChosen(panel, chosen.photo, crown);
   else drawRest(panel);
-  if (crown && wasInput) panel.querySelector("input").focus();
-  else if (crown) cardOf(chosen.photo).rows.querySelector(`[data-id="${crown.id}"]`)
-    ?.focus({ preventScroll: true });
-  const left = photos.filter((photo) => !isUsed(photo));
+const left = photos.filter((photo) => !isUsed(photo));
   find("aside").hidden = !left.length;
   find("aside").querySelector(".small").replaceChildren(...left.map((photo) => make("figure", {},
     make("img", { src: photo.picture, alt: `Photograph ${photo.name}, left out.` }),
     make("figcaption", {}, make("b", {}, photo.name), make("br"), photo.aside || "left out by you"),
     photo.crowns.length ? make("button", { type: "button", onclick: () => useIt(photo, true) },
       "Use it") : null)));
-  find("undo").disabled = !past.length;
+  find("undo").setAttribute("aria-disabled", String(!past.length));
+  // Where the focus was on the crown, it is on its chip; else it stays where it was. What has gone
+  // or can't be pressed any more leaves it to what takes that back.
+  const near = atCrown && (chosen ?? shown);
+  shown = chosen;
+  const wish = crown && writing ? panel.querySelector("input")
+    : near ? cardOf(near.photo).rows.querySelector(`[data-id="${near.id}"]`) : active;
+  (wish?.isConnected && !wish.disabled ? wish : find("undo")).focus({ preventScroll: true });
   const again = savedOnce && yamlOf(photos) === saved;
   find("save").textContent = `Save ${data.file}${again ? " again" : ""}`;
 };
@@ -289,7 +295,10 @@ const save = async () => {
   } }, "Copy");
   find("next").replaceChildren(
     make("b", {}, `${data.file} is ${how}. Two steps to go:`),
-    make("button", { type: "button", onclick: () => { find("next").hidden = true; } }, "Close"),
+    make("button", { type: "button", onclick: () => {
+      find("next").hidden = true;
+      find("save").focus();
+    } }, "Close"),
     make("ol", {},
       make("li", {}, data.target ? `Put it in the place of ${data.target}`
         : "Put it into the workspace folder, beside this page",
