@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import html
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,31 +16,10 @@ from pipeline.studies.report import run_report
 from stages.dentition.corrections import apply_corrections
 from stages.dentition.crowns import mirrored_dentition
 from tests import teeth_case as case
-from tests.browser import browse, console, needs_chromium
+from tests.browser import needs_chromium
+from tests.studies.check_case import SAVE, data_of, doubtful_case, probed
 from tests.studies.report_case import write_result
 from tests.studies.report_page import assert_alone, text_of
-
-
-def doubtful_case(
-    folder: Path, teeth: Teeth | None = None, failure: str = "Doubtful.",
-    corner: tuple[int, int] = (0, 0),
-) -> Path:  # fmt: skip
-    """A workspace in which init found teeth, but no safe result."""
-    folder.mkdir()
-    request = {"images": ["/photos"], "preset": None, "overrides": ["fit.iterations=20"],
-               "stages": ["views", "init"], "from": None}  # fmt: skip
-    (folder / "request.json").write_text(json.dumps(request))
-    write_result(folder, "views", [case.views(corner=corner)])
-    store = Store(folder)
-    store.failures.keep("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
-    store.failures.record("init", "key", failure)
-    return folder
-
-
-def data_of(page: str) -> dict[str, Any]:
-    found = re.search(r'id="data">(.*?)</script>', page, re.S)
-    assert found
-    return json.loads(found[1])
 
 
 def test_a_doubtful_case_gets_the_page_and_the_report_leads_to_it(tmp_path: Path) -> None:
@@ -102,36 +78,6 @@ def test_a_wrong_file_is_said_on_the_page(tmp_path: Path, text: str) -> None:
     assert "could not be drawn" not in (workspace / "report.html").read_text()
 
 
-#: What every script on the page begins and ends with.
-BEGIN = """<script>
-(async () => {
-  const result = {};
-  const wait = (ms = 50) => new Promise((done) => setTimeout(done, ms));
-  const all = (query, inside = document) => [...inside.querySelectorAll(query)];
-  const card = (k) => all("article")[k];
-  const chip = (k, text) => all(".chip", card(k)).find((entry) => entry.textContent === text);
-  const deed = (text) => all("#panel button").find((entry) => entry.textContent.startsWith(text));
-  const press = (key, more = {}) => document.activeElement.dispatchEvent(
-    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...more }));
-  const row = (k) => all(".chip", card(k)).map((entry) => entry.textContent);
-  const notes = (k) => card(k).querySelector(".notes").textContent;
-"""
-SAVE = """
-  window.showSaveFilePicker = undefined;
-  window.Blob = class { constructor(parts) { result.yaml = parts.join(""); } };
-  URL.createObjectURL = () => "blob:x";
-  HTMLAnchorElement.prototype.click = function () { result.download = this.download; };
-  document.getElementById("save").click();
-  await wait();
-"""
-END = """
-  const text = document.createElement("pre");
-  text.id = "result";
-  text.textContent = JSON.stringify(result);
-  document.body.append(text);
-})();
-</script></body>"""
-
 PROBE = """
   result.cards = all("article").length;
   result.left = all("#aside figure").map((entry) => entry.textContent);
@@ -189,20 +135,6 @@ SAVED = """
 READ = "result.yaml = check.yaml();"
 
 
-def probed(workspace: Path, folder: Path, *script: str) -> dict[str, Any]:
-    """What a script finds on the page of a case."""
-    run_report(workspace)
-    page = workspace / "check.html"
-    page.write_text(page.read_text().replace("</body>", "".join([BEGIN, *script, END])))
-    folder.mkdir(exist_ok=True)
-    dom, log = browse(page, folder, (1300, 900), "--dump-dom")
-    assert console(log) == []
-    found = re.search(r'<pre id="result">(.*?)</pre>', dom, re.S)
-    assert found
-    result: dict[str, Any] = json.loads(html.unescape(found[1]))
-    return result
-
-
 @needs_chromium
 @pytest.mark.parametrize("corner", [(0, 0), (30, 20)])
 def test_everything_can_be_put_right_in_a_browser(tmp_path: Path, corner: tuple[int, int]) -> None:
@@ -248,62 +180,6 @@ def test_everything_can_be_put_right_in_a_browser(tmp_path: Path, corner: tuple[
     assert [len(photo["earlier"]["crowns"]) for photo in again] == [2, 8, 12]
     assert again[2]["earlier"]["use"] is True
     assert probed(workspace, tmp_path / "browser", READ) == {"yaml": result["yaml"]}
-
-
-FOCUS = """
-  const at = () => {
-    const active = document.activeElement;
-    const where = active.closest("article")?.getAttribute("aria-label") ?? active.parentElement.id;
-    const what = active === document.body ? "nothing" : active.ariaLabel ?? active.textContent;
-    return `${what} in ${where}`;
-  };
-  const hit = (button) => { button.focus(); button.click(); };
-  const head = (k, text) => all(".head button", card(k))
-    .find((entry) => entry.textContent === text);
-  hit(chip(0, "12")); press("Escape");
-  result.escape = at();
-  hit(chip(0, "12")); hit(document.querySelector("#panel .close"));
-  result.close = at();
-  hit(chip(0, "12"));
-  document.querySelector("#panel input").focus(); press("Escape");
-  result.field = at();
-  hit(chip(1, "21"));
-  head(0, "Mirror image").focus(); head(0, "Mirror image").click();
-  result.mirror = at();
-  const kind = card(0).querySelector("select");
-  kind.focus(); kind.value = "left"; kind.dispatchEvent(new Event("change"));
-  result.kind = at().split(" in ")[1];
-  hit(document.getElementById("undo")); hit(document.getElementById("undo"));
-  result.undo = at();
-  head(1, "All numbers are right").focus(); hit(head(1, "All numbers are right"));
-  result.sure = at();
-  hit(head(0, "Leave out"));
-  result.left = [at(), all("article").length];
-  document.activeElement.click();
-  result.back = [at(), all("article").length];
-  hit(all("#aside button")[0]);
-  result.used = [at(), all("article").length];
-  hit(chip(0, "12")); press("z", { ctrlKey: true });
-  result.keys = at();
-  document.getElementById("undo").focus();
-  for (let k = 0; k < 9; k++) document.activeElement.click();
-  result.all = [at(), all("article").length];
-"""
-
-
-@needs_chromium
-def test_the_focus_stays_where_one_works(tmp_path: Path) -> None:
-    result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", FOCUS)
-    chip = "upper row, 2 of 6: 12, upper right lateral incisor in 0_right.jpg"
-    assert [result[how] for how in ("escape", "close", "field")] == [chip] * 3
-    assert result["mirror"] == "Mirror image in 0_right.jpg"
-    assert result["kind"] == "0_right.jpg"
-    assert result["undo"] == result["sure"] == "Undo in "
-    assert result["left"] == ["Undo in ", 1], "what was pressed is gone: what brings it back"
-    assert result["back"] == ["Undo in ", 2]
-    assert result["used"] == ["Undo in ", 3]
-    assert result["keys"].startswith("upper row, 4 of 6: 21"), "where what was undone stands"
-    assert result["all"] == ["Undo in ", 2]
 
 
 #: The first photograph shows four teeth of a jaw in its left half; of the second, init has found

@@ -38,18 +38,24 @@ const say = (text, bad = false) => {
 
 // -- what can be done ------------------------------------------------------------------------------
 
+const stateNow = () => photos.map((photo) => changing.map((name) => photo[name]));
+const takeState = (state) => {
+  photos.forEach((photo, k) => changing.forEach((name, n) => { photo[name] = state[k][n]; }));
+};
 const change = (deed) => {
-  past.push({ state: photos.map((photo) => changing.map((name) => photo[name])), chosen });
+  past.push({ state: stateNow(), chosen });
   deed();
   [cut, typed] = [null, ""];
   find("next").hidden = true;
+  remember();
   draw();
 };
 const undo = () => {
   const before = past.pop();
   if (!before) return;
-  photos.forEach((photo, k) => changing.forEach((name, n) => { photo[name] = before.state[k][n]; }));
+  takeState(before.state);
   [chosen, cut, typed] = [before.chosen, null, ""];
+  remember();
   say("Undone.");
   draw();
 };
@@ -228,4 +234,5 @@ document.addEventListener("keydown", (event) => {
   }
   event.preventDefault();
 });
+{% include "check_memory.js" %}
 {% include "check_view.js" %}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -94,7 +96,10 @@ def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
         names = (view.source_name, view.source_name.rpartition(".")[0], view.name)
         label = next((name for name in names if name in earlier), view.source_name or view.name)
         photographs.append(_photograph(view, seen, label, earlier.get(label, PhotoCorrection())))
-    return {"file": CORRECTIONS, "doubtful": DOUBTFUL, "photographs": photographs}
+    digest = hashlib.sha256(json.dumps(photographs).encode()).hexdigest()
+    return {
+        "file": CORRECTIONS, "doubtful": DOUBTFUL, "photographs": photographs, "digest": digest,
+    }  # fmt: skip
 
 
 def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrection) -> Content:

@@ -286,6 +286,7 @@ const save = async () => {
     how = "downloaded";
   }
   [saved, savedOnce] = [text, true];
+  remember();
   const place = folder();
   const quote = /^[\w./+:-]+$/.test(place) ? place : `'${place.replaceAll("'", "'\\''")}'`;
   const command = [data.command[0], quote || "WORKSPACE", data.command[1]].join(" ").trim();

@@ -1,0 +1,154 @@
+"""How one works on `check.html`: where the focus is, and what is there when it is opened again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.studies.report import run_report
+from tests import teeth_case as case
+from tests.browser import needs_chromium
+from tests.studies.check_case import SAVE, data_of, doubtful_case, probed
+
+FOCUS = """
+  const at = () => {
+    const active = document.activeElement;
+    const where = active.closest("article")?.getAttribute("aria-label") ?? active.parentElement.id;
+    const what = active === document.body ? "nothing" : active.ariaLabel ?? active.textContent;
+    return `${what} in ${where}`;
+  };
+  const hit = (button) => { button.focus(); button.click(); };
+  const head = (k, text) => all(".head button", card(k))
+    .find((entry) => entry.textContent === text);
+  hit(chip(0, "12")); press("Escape");
+  result.escape = at();
+  hit(chip(0, "12")); hit(document.querySelector("#panel .close"));
+  result.close = at();
+  hit(chip(0, "12"));
+  document.querySelector("#panel input").focus(); press("Escape");
+  result.field = at();
+  hit(chip(1, "21"));
+  head(0, "Mirror image").focus(); head(0, "Mirror image").click();
+  result.mirror = at();
+  const kind = card(0).querySelector("select");
+  kind.focus(); kind.value = "left"; kind.dispatchEvent(new Event("change"));
+  result.kind = at().split(" in ")[1];
+  hit(document.getElementById("undo")); hit(document.getElementById("undo"));
+  result.undo = at();
+  head(1, "All numbers are right").focus(); hit(head(1, "All numbers are right"));
+  result.sure = at();
+  hit(head(0, "Leave out"));
+  result.left = [at(), all("article").length];
+  document.activeElement.click();
+  result.back = [at(), all("article").length];
+  hit(all("#aside button")[0]);
+  result.used = [at(), all("article").length];
+  hit(chip(0, "12")); press("z", { ctrlKey: true });
+  result.keys = at();
+  document.getElementById("undo").focus();
+  for (let k = 0; k < 9; k++) document.activeElement.click();
+  result.all = [at(), all("article").length];
+"""
+
+
+@needs_chromium
+def test_the_focus_stays_where_one_works(tmp_path: Path) -> None:
+    result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", FOCUS)
+    chip = "upper row, 2 of 6: 12, upper right lateral incisor in 0_right.jpg"
+    assert [result[how] for how in ("escape", "close", "field")] == [chip] * 3
+    assert result["mirror"] == "Mirror image in 0_right.jpg"
+    assert result["kind"] == "0_right.jpg"
+    assert result["undo"] == result["sure"] == "Undo in "
+    assert result["left"] == ["Undo in ", 1], "what was pressed is gone: what brings it back"
+    assert result["back"] == ["Undo in ", 2]
+    assert result["used"] == ["Undo in ", 3]
+    assert result["keys"].startswith("upper row, 4 of 6: 21"), "where what was undone stands"
+    assert result["all"] == ["Undo in ", 2]
+
+
+#: The page is opened five times; what it told before is kept beside what it remembers itself.
+REOPENED = """
+  Object.assign(result, JSON.parse(localStorage.told ?? '{"opened": []}'));
+  BeforeUnloadEvent.prototype.preventDefault = () => {};
+  const back = document.getElementById("back");
+  result.opened.push([back.hidden ? "" : back.textContent.replace(/of .* are/, "of TODAY are"),
+    check.yaml(), document.getElementById("save").textContent]);
+  const k = result.opened.length;
+  if (k === 1) {
+    chip(0, "12").click();
+    deed("Split").click();
+    press("Enter");
+    press("1"); press("2");
+    all(".head button", card(1)).find((entry) => entry.textContent === "Mirror image").click();
+    all("#aside button")[0].click();
+  }
+  if (k === 2) {
+    chip(0, "?").click();
+    deed("Split").click();
+    press("Enter");
+    const ids = check.photos.flatMap(({ crowns }) => crowns.map(({ id }) => id));
+    result.own = ids.length === new Set(ids).size;
+    press("z", { ctrlKey: true });
+SAVING
+  }
+  if (k === 3) {
+    back.querySelector("button").click();
+    result.discarded = [check.yaml(), back.hidden, document.activeElement.id];
+    document.getElementById("undo").click();
+    result.undiscarded = check.yaml();
+  }
+  if (k === 4) {
+    const key = Object.keys(localStorage).find((name) => name.startsWith("dentalsplat check"));
+    const kept = JSON.parse(localStorage[key]);
+    localStorage["dentalsplat check 1 elsewhere"] = JSON.stringify({ on: 1 });
+    localStorage[key] = JSON.stringify({ ...kept, of: "another run's data" });
+  }
+  if (k === 5) result.elsewhere = "dentalsplat check 1 elsewhere" in localStorage;
+  localStorage.told = JSON.stringify(result);
+  if (k < 5) location.reload();
+"""
+
+
+@needs_chromium
+def test_changes_are_there_when_the_page_is_opened_again(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    result = probed(workspace, tmp_path / "browser", REOPENED.replace("SAVING", SAVE))
+    opened = result["opened"]
+    changed = result["yaml"]
+    bare, button = "# Written", "Save teeth.yaml"
+    assert opened[0][0] == "" and opened[0][1].startswith(bare) and opened[0][2] == button
+    assert all(word in changed for word in ("split: ", "tooth: 12", "mirrored: true", "use: true"))
+    unsaved = "Your changes of TODAY are back, not saved in teeth.yaml yet. Discard"
+    assert opened[1] == [unsaved, changed, button]
+    assert result["own"], "each crown has an id of its own"
+    assert opened[2] == ["Your changes of TODAY are back. Discard", changed, f"{button} again"]
+    assert result["discarded"] == [opened[0][1], True, "undo"]
+    assert result["undiscarded"] == changed
+    assert opened[3][1] == changed
+    assert opened[4] == ["", opened[0][1], button], "another run's page begins clean"
+    assert result["elsewhere"] is False, "nothing is kept for ever"
+
+
+@needs_chromium
+def test_a_browser_that_keeps_nothing_is_no_error(tmp_path: Path) -> None:
+    refused = """
+  Object.defineProperty(window, "localStorage",
+    { get() { throw new DOMException("no", "SecurityError"); } });
+  chip(0, "12").click();
+  press("2"); press("2");
+  result.yaml = check.yaml();
+"""
+    result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", refused)
+    assert "tooth: 22" in result["yaml"]
+
+
+def test_what_is_remembered_counts_for_the_pages_own_data(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+
+    def digest() -> str:
+        run_report(workspace)
+        return str(data_of((workspace / "check.html").read_text())["digest"])
+
+    first = digest()
+    assert digest() == first
+    case.write(workspace / "teeth.yaml", "photographs: {0_right.jpg: {kind: right}}")
+    assert digest() != first, "what a run knows is not changed again"
