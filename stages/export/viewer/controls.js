@@ -24,11 +24,24 @@ function addViewButtons(viewer) {
   byId("view-count").textContent = count === 1 ? "one photograph" : `${count} photographs`;
 }
 
+const focusBefore = new Map();
+
+/** A panel takes the focus, and gives it back to what had it; else to the button that opens it. */
+function showPanel(panel, button, shown) {
+  const active = document.activeElement;
+  const inside = panel.contains(active);
+  if (shown && !inside) focusBefore.set(panel, active === document.body ? button : active);
+  panel.hidden = !shown;
+  button.setAttribute("aria-expanded", shown);
+  if (shown) panel.querySelector("button").focus();
+  else if (inside || active === document.body) {
+    const before = focusBefore.get(panel);
+    (before?.getClientRects().length ? before : button).focus({ preventScroll: true });
+  }
+}
+
 function showHelp(shown) {
-  byId("help").hidden = !shown;
-  byId("ask").setAttribute("aria-expanded", shown);
-  if (shown) byId("close").focus();
-  else if (byId("help").contains(document.activeElement)) byId("ask").focus();
+  showPanel(byId("help"), byId("ask"), shown);
 }
 
 function showPhoto(viewer, share) {

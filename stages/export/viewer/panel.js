@@ -98,10 +98,7 @@ function addPanel(viewer, tools) {
   byId("at").addEventListener("input", (event) => tools.show({ at: event.target.value / 100 }));
   byId("copy").addEventListener("click", () => tools.copyLink());
   byId("more").addEventListener("click", () => tools.open(byId("tools").hidden));
-  byId("done").addEventListener("click", () => {
-    tools.open(false);
-    byId("more").focus();
-  });
+  byId("done").addEventListener("click", () => tools.open(false));
   for (const key of ["numbers", "jaw", "support", "mesh"]) {
     byId(key).closest("label").hidden = !tools.has(key);
   }

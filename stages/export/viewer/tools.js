@@ -101,12 +101,8 @@ class Tools {
   }
 
   open(shown) {
-    const inside = byId("tools").contains(document.activeElement);
-    byId("tools").hidden = !shown;
-    byId("more").setAttribute("aria-expanded", shown);
     document.body.classList.toggle("tools-open", shown);
-    if (shown) byId("tools").querySelector("button").focus();
-    else if (inside || document.activeElement === document.body) byId("more").focus();
+    showPanel(byId("tools"), byId("more"), shown);
     this.viewer.wake(false);
   }
 
@@ -115,10 +111,8 @@ class Tools {
     const { pending, tool } = this.store.now;
     if (pending.length) this.store.set({ pending: [] });
     else if (tool !== "turn") this.choose(tool);
-    else if (!byId("tools").hidden && byId("help").hidden) {
-      this.open(false);
-      byId("more").focus();
-    } else return false;
+    else if (!byId("tools").hidden && byId("help").hidden) this.open(false);
+    else return false;
     return true;
   }
 
