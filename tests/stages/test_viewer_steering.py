@@ -45,3 +45,48 @@ def test_the_focus_goes_back_where_it_was(tmp_path: Path) -> None:
     assert found["button"] == ["done", "more"]
     assert found["within"] == ["close", "jaw"]
     assert found["end"] == "more"
+
+
+PACE = """(async () => {
+  await page.ready;
+  let now = performance.now();
+  const frame = (gap) => {
+    now += gap;
+    const callbacks = waiting;
+    waiting = [];
+    callbacks.forEach((callback) => callback(now));
+    return canvas.width;
+  };
+  const pointer = (type, x) => canvas.dispatchEvent(
+    new PointerEvent(type, { pointerId: 5, clientX: x, clientY: 100, button: 0, buttons: 1 }));
+  const drag = (gaps) => {
+    pointer("pointerdown", 100);
+    const widths = gaps.map((gap, k) => {
+      pointer("pointermove", 120 + 20 * k);
+      return frame(gap);
+    });
+    pointer("pointerup", 0);
+    frame(16);
+    return widths;
+  };
+  frame(16);
+  const result = { whole: canvas.width };
+  result.rests = [drag([5000, 16, 16]), drag([3000, 16, 16]), drag([16, 2000, 16, 2000, 16])];
+  result.slow = drag([3000, 1500, 1500, 1500, 1500, 1500, 1500, 1500]);
+  result.end = canvas.width;
+  tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_the_slowest_devices_move_at_a_lower_resolution(tmp_path: Path) -> None:
+    frames = "let waiting = []; requestAnimationFrame = (callback) => waiting.push(callback);"
+    page = ball_page().replace("<head>", f"<head><script>{frames}</script>", 1)
+    found, log = run_in(page, HEAD + PACE, tmp_path, (640, 480), address="#still")
+    assert (found["errors"], log) == ("", [])
+    whole = found["whole"]
+    assert all(width == whole for widths in found["rests"] for width in widths), "these are rests"
+    assert found["slow"][0] == whole
+    assert found["slow"] == sorted(found["slow"], reverse=True)
+    assert found["slow"][-1] < 0.45 * whole
+    assert found["end"] == whole, "at rest it is whole again"

@@ -17,6 +17,7 @@ class Screen {
     this.still = false;     // no transitions
     this.detail = 1;        // share of the screen's resolution while moving
     this.lastFrame = 0;
+    this.gap = 0;           // between the last two frames that moved, in milliseconds
     this.moved = false;
     this.asleep = true;
   }
@@ -48,7 +49,10 @@ class Screen {
 
   /** On slow devices, move at a lower resolution and come to rest at the full one. */
   #adapt(moving, elapsed) {
-    if (!moving || elapsed > 1000) {
+    // One long gap is a rest before the hand moved on; a second one after it is a slow device.
+    const rested = elapsed > 1000 && !(this.gap > 1000);
+    this.gap = moving ? elapsed : 0;
+    if (!moving || rested) {
       this.shown = 1;
       return;
     }
