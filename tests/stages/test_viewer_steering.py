@@ -90,3 +90,34 @@ def test_the_slowest_devices_move_at_a_lower_resolution(tmp_path: Path) -> None:
     assert found["slow"] == sorted(found["slow"], reverse=True)
     assert found["slow"][-1] < 0.45 * whole
     assert found["end"] == whole, "at rest it is whole again"
+
+
+LOST = """(async () => {
+  await page.ready;
+  const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+  const before = colours();
+  const card = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+  const lose = async (away) => {
+    card.loseContext();
+    await wait(away);
+    const said = [$("message").hidden, $("reason").textContent];
+    card.restoreContext();
+    await wait(500);
+    return [...said, $("message").hidden, colours().join() === before.join()];
+  };
+  const result = { soon: await lose(500), late: await lose(5000) };
+  await wait(5000);
+  result.end = $("message").hidden;
+  tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_a_graphics_context_that_stays_away_is_said(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(), HEAD + LOST, tmp_path, (640, 480), address="#still")
+    assert found["errors"] == ""
+    assert all("CONTEXT_LOST_WEBGL" in line for line in log)
+    assert found["soon"] == [True, "", True, True], "what comes back at once is nobody's concern"
+    hidden, reason, *after = found["late"]
+    assert hidden is False and "load the page again" in reason
+    assert after == [True, True] and found["end"] is True, "it came back after all"

@@ -266,3 +266,26 @@ def test_without_webgl_the_pictures_stay(page: str, tmp_path: Path) -> None:
     assert told["live"] is True
     assert told["stills"] == "grid"
     assert "WebGL2" in told["why"]
+
+
+@needs_chromium
+def test_a_graphics_context_that_stays_away_leaves_the_pictures(page: str, tmp_path: Path) -> None:
+    script = """(async () => {
+      await visits.ready;
+      const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+      const sum = () => visits.pair.pixels().reduce((total, value) => total + value, 0);
+      const state = () => [document.documentElement.dataset.scenes,
+        document.getElementById("live").hidden];
+      const before = sum();
+      const card = document.getElementById("both").getContext("webgl2")
+        .getExtension("WEBGL_lose_context");
+      card.loseContext();
+      await wait(5000);
+      const lost = state();
+      card.restoreContext();
+      await wait(500);
+      tell({ lost, back: state(), same: sum() === before });
+    })();"""
+    told, log = run_in(page, script, tmp_path, (1280, 900), coarse=True)
+    assert all("CONTEXT_LOST_WEBGL" in line for line in log)
+    assert told == {"lost": ["pictures", True], "back": ["live", False], "same": True}

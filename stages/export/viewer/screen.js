@@ -120,4 +120,27 @@ class Screen {
   }
 }
 
+/** How long, in milliseconds, a graphics context may be away before that is said. */
+const LONGEST_LOSS = 4000;
+
+/**
+ * Draw again when a lost graphics context comes back.
+ *
+ * @param {HTMLCanvasElement} canvas
+ * @param {() => void} restore makes everything on the graphics card again, and draws
+ * @param {(gone: boolean) => void} tell it does not come back, or has come back after all
+ */
+function keepContext(canvas, restore, tell) {
+  let waiting = 0;
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();
+    waiting = setTimeout(() => tell(true), LONGEST_LOSS);
+  });
+  canvas.addEventListener("webglcontextrestored", () => {
+    clearTimeout(waiting);
+    tell(false);
+    restore();
+  });
+}
+
 const depthAxis = (pose) => [...pose.rotation.slice(6, 9), pose.translation[2]];

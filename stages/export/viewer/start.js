@@ -95,10 +95,17 @@ async function start() {
 
   addEventListener("resize", () => viewer.wake(false));
   addEventListener("hashchange", () => readAddress(viewer, tools));
-  viewer.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-  viewer.canvas.addEventListener("webglcontextrestored", () => {
+  const restore = () => {
     viewer.renderer.restore();
     viewer.wake();
+  };
+  keepContext(viewer.canvas, restore, (gone) => {
+    if (gone) {
+      byId("reason").textContent = "The browser took the graphics card away from this page. Copy a link (L) "
+        + "if you made marks, then load the page again; if that does not help, close other pages with 3D "
+        + "scenes or start the browser anew.";
+    }
+    byId("message").hidden = !gone;
   });
 }
 

@@ -154,19 +154,22 @@ async function startPair() {
   const both = await Promise.all(page.scenes.map(
     ({ format }, index) => unpacked(element(`splats-${index}`).textContent, format)));
   const stage = element("live");
+  const show = (live) => {
+    stage.hidden = !live;
+    document.documentElement.dataset.scenes = live ? "live" : "pictures";
+  };
   const pair = new Pair(element("both"), page, both);
   addControls(pair);
-  stage.hidden = false;
+  show(true);
   pair.show("wipe", 0.5);
   pair.goTo(page.first, true);
   pair.render();
-  document.documentElement.dataset.scenes = "live";
   new ResizeObserver(() => pair.wake(false)).observe(pair.canvas);
-  pair.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-  pair.canvas.addEventListener("webglcontextrestored", () => {
+  const restore = () => {
     for (const { renderer } of pair.visits) renderer.restore();
     pair.wake();
-  });
+  };
+  keepContext(pair.canvas, restore, (gone) => show(!gone));
   window.visits.pair = pair;
 }
 
