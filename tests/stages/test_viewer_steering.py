@@ -121,3 +121,35 @@ def test_a_graphics_context_that_stays_away_is_said(tmp_path: Path) -> None:
     hidden, reason, *after = found["late"]
     assert hidden is False and "load the page again" in reason
     assert after == [True, True] and found["end"] is True, "it came back after all"
+
+
+BRACKETS = """(async () => {
+  await page.ready;
+  press("x");
+  const moved = (key, more) => {
+    const before = page.state.at;
+    press(key, document.body, more);
+    return Math.round(100 * (page.state.at - before));
+  };
+  tell({
+    plain: [moved("["), moved("]")],
+    mac: [moved("[", { altKey: true, code: "Digit5" }), moved("]", { altKey: true })],
+    windows: [moved("]", { altKey: true, ctrlKey: true, code: "Digit9" })],
+    places: [moved("ü", { code: "BracketLeft" }), moved("ъ", { code: "BracketRight" })],
+    zooms: moved("+", { code: "BracketRight" }),
+    browser: [moved("[", { metaKey: true, code: "BracketLeft" }),
+      moved("[", { ctrlKey: true, code: "BracketLeft" }),
+      moved("ü", { altKey: true, code: "BracketLeft" })],
+    errors: document.documentElement.dataset.errors ?? "",
+  });
+})();"""
+
+
+@needs_chromium
+def test_the_section_moves_on_all_keyboards(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(), HEAD + BRACKETS, tmp_path, (640, 480), address="#still")
+    assert (found["errors"], log) == ("", [])
+    assert found["plain"] == found["mac"] == found["places"] == [-5, 5]
+    assert found["windows"] == [5]
+    assert found["zooms"] == 0, "what a layout has there goes first"
+    assert found["browser"] == [0, 0, 0], "shortcuts of the browser stay"

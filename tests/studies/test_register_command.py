@@ -164,8 +164,8 @@ const found = () => {
     for (let k = 1; k <= 5; k++) fire("pointermove", from + (to - from) * k / 5);
     fire("pointerup", to);
   };
-  const press = (key) => pair.canvas.dispatchEvent(
-    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+  const press = (key, more) => pair.canvas.dispatchEvent(
+    new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...more }));
   const box = pair.canvas.getBoundingClientRect();
   const told = { state: document.documentElement.dataset.scenes };
   told.stills = getComputedStyle(document.querySelector(".stills")).display;
@@ -186,7 +186,7 @@ const found = () => {
   by("wipe").click();
   drag(by("edge"), box.left + box.width / 2, box.left + box.width * 0.8);
   told.edgeAt = by("between").value;
-  press("[");
+  press("ü", { code: "BracketLeft" });
   told.keyed = by("between").value;
   by("swap").click();
   told.swapped = by("between").value;

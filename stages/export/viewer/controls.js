@@ -101,7 +101,8 @@ function addKeys(viewer, tools) {
   const keys = keysOf(viewer, tools);
   const fields = "input, select, textarea, dialog";
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const key = keyOf(event, keys);
+    if (key === null) return;
     const within = event.target.matches?.(fields);
     if (within && event.key !== "Escape") return;
     const onScene = event.target === viewer.canvas;
@@ -110,7 +111,6 @@ function addKeys(viewer, tools) {
       event.preventDefault();
       return;
     }
-    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (keys[key]) {
       if (key.startsWith("Arrow") || key === "+" || key === "-") viewer.stopTurning();
       keys[key](event.shiftKey);

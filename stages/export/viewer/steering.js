@@ -79,3 +79,16 @@ function steeringKeys(screen) {
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
   };
 }
+
+/**
+ * Which of the keys an event means, null if it is for the browser. Many layouts have brackets only
+ * with Option or AltGr; where a layout has none, those in the places of the brackets are taken.
+ *
+ * @param {KeyboardEvent} event @param {object} keys key -> what it does
+ */
+function keyOf(event, keys) {
+  const typed = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if (event.metaKey || event.ctrlKey && !event.altKey) return null;
+  if (event.altKey) return typed === "[" || typed === "]" ? typed : null;
+  return keys[typed] ? typed : { BracketLeft: "[", BracketRight: "]" }[event.code] ?? typed;
+}

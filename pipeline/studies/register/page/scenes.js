@@ -142,9 +142,9 @@ function addControls(pair) {
     r: () => pair.goTo(pair.page.first),
   };
   pair.canvas.addEventListener("keydown", (event) => {
-    const act = keys[event.key];
-    if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
-    act(event.shiftKey);
+    const key = keyOf(event, keys);
+    if (!keys[key]) return;
+    keys[key](event.shiftKey);
     event.preventDefault();
   });
 }
