@@ -25,6 +25,7 @@ from pipeline.studies.batch.records import Case, new_record, write_case
 from pipeline.studies.batch.sources import contents_of, settings_of
 from pipeline.studies.batch.summary import MEASURED, csv_text, write_summary
 from stages.export.measuring.measures import RULES
+from tests.browser import needs_chromium, run_in
 
 DATA = Path(__file__).resolve().parents[2] / "data_samples"
 HOSTILE = (
@@ -263,6 +264,32 @@ def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:
     assert len(rows) == 950
     assert rows[0]["reason"] == f"'=cmd {bad} second line"
     assert (rows[1]["name"], rows[1]["psnr"]) == ("'=1+1", "31.25")
+
+
+@needs_chromium
+def test_the_summary_says_how_many_are_found(tmp_path: Path) -> None:
+    records = [new_record(Case(f"c{n}", f"case {n}"), "waiting") for n in range(3)]
+    records.append(new_record(Case("x", "x"), "done"))
+    write_summary(tmp_path, records, "Batch", "")
+    script = """
+      const field = document.querySelector(".filters input");
+      const found = (text) => {
+        field.value = text;
+        field.dispatchEvent(new Event("input"));
+        return [document.getElementById("found").textContent,
+          document.querySelectorAll("tbody tr:not([hidden])").length];
+      };
+      const told = [found("case"), found(""), found("no such case")];
+      document.querySelector("[data-state=done]").click();
+      tell({ told: [...told, found(" X "), found("case 1")] });"""
+    page = (tmp_path / "summary.html").read_text()
+    told, log = run_in(page, script, tmp_path, (1280, 800))
+    assert log == []
+    nothing, *_ = told["told"][2]
+    assert nothing.startswith("No case found.")
+    assert told["told"] == [
+        ["3 of 4 cases", 3], ["", 4], [nothing, 0], ["1 of 4 cases", 1], [nothing, 0],
+    ]  # fmt: skip
 
 
 def test_the_table_has_all_that_is_measured() -> None:
