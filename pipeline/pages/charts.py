@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -25,6 +26,8 @@ INK, FAINT = "#010203", "#040506"
 PAGE_COLORS = {INK: "currentColor", FAINT: "var(--line)"}
 #: Series colours that tell apart for the colour-blind (Okabe and Ito), on light and dark pages.
 SERIES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8a8a8a")
+#: Letters of a line of a legend in two columns.
+WIDEST_NAME = 22
 #: Ratio of largest to least value from which on a logarithmic axis has enough ticks.
 WIDE_RANGE = 20
 #: Pixels along the long side of the picture of the points under the cameras.
@@ -316,7 +319,8 @@ def series_chart(
                     x, [values[k] for k in x], ls=style, color=color[name], lw=1.6, ms=5,
                     marker=marks[names.index(name) % len(marks)],
                     markerfacecolor=color[name] if style == "-" else "none",
-                    label=_plain(name) if style == "-" or name not in series else None,
+                    label=fill(_plain(name), WIDEST_NAME, max_lines=3, placeholder=" …")
+                    if style == "-" or name not in series else None,
                 )  # fmt: skip
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])

@@ -8,12 +8,14 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipeline.artifacts.views import write_png
 from pipeline.studies.benchmark.report import benchmark_report, charts, grid_table, groups
 from pipeline.studies.benchmark.suite import Suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
 from stages.evaluate.images.pictures import comparison
-from tests.browser import needs_chromium
+from tests.browser import needs_chromium, run_in
 from tests.studies import report_case as case
 from tests.studies.report_page import assert_alone, look, text_of
 
@@ -163,3 +165,37 @@ def test_a_browser_draws_it(tmp_path: Path) -> None:
     seen = look(benchmark_report(found, tmp_path), tmp_path)
     assert seen["wide"]["images"] == 5
     assert len(seen["phone"]["charts"]) == 4
+
+
+LONG_NAMES = """
+  const table = document.querySelector(".scroll");
+  const [name, figure] = table.querySelector("tbody tr").cells;
+  const box = name.getBoundingClientRect();
+  const outside = [...document.querySelectorAll("svg.chart")].flatMap((chart) => {
+    const { left, right, top, bottom } = chart.getBoundingClientRect();
+    return [...chart.querySelectorAll("text")].filter((text) => {
+      const at = text.getBoundingClientRect();
+      return at.left < left - 1 || at.right > right + 1 || at.top < top || at.bottom > bottom + 1;
+    }).map((text) => text.textContent);
+  });
+  table.scrollLeft = figure.offsetLeft - box.width;
+  tell({ share: box.width / innerWidth, shown: name.scrollWidth <= name.clientWidth,
+    figure: figure.getBoundingClientRect().left >= name.getBoundingClientRect().right - 1,
+    width: innerWidth, charts: document.querySelectorAll("svg.chart text").length, outside });
+"""
+
+
+@needs_chromium
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("name", ["20240513_frontal_retracted_view_of_may_IMG_1234", "n" * 160])
+def test_long_names_leave_the_figures_in_sight(tmp_path: Path, name: str, width: int) -> None:
+    found = results(cells_of_two_methods())
+    for method in found["suite"]["methods"]:
+        method["title"] = f"{method['title']} {name}"
+    suite = Suite.model_validate(found["suite"])
+    found["tables"] = [build_table(suite, suite.tables[0], found["cells"])]
+    page = benchmark_report(found, tmp_path).read_text()
+    told, log = run_in(page, LONG_NAMES, tmp_path, (width, 900))
+    assert (log, told["width"]) == ([], width)
+    assert told["share"] <= 0.51 and told["shown"] and told["figure"]
+    assert told["charts"] > 20 and told["outside"] == []
