@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.artifacts.views import Views
 from stages.fit import numerics
+from stages.fit.parts.harmonics import Harmonics
 from stages.fit.stage import FitStage
 from stages.splatting.harmonics import harmonics
 from stages.splatting.rasterizer import use_threads
@@ -132,6 +133,37 @@ def test_only_held_surfaces_without_a_light_have_it(tmp_path) -> None:
         here = context(tmp_path / name, few, cameras, points, iterations=4, **config)
         FitStage().run(here)
         assert ("harmonics" in here.figures["parts"].split(", ")) == there, name
+
+
+@pytest.mark.parametrize(
+    ("iterations", "changes"),
+    [
+        (1, {"coarse_fraction": 0.5}),  # before the first iteration
+        (6, {"harmonics_at": 1.0}),
+        # far from right at .35, so that there are twice as many: .3 of these comes later
+        (10, {"harmonics_at": 0.3, "extension": 1.0, "extension_psnr": (80, 90)}),
+    ],
+)
+def test_it_is_done_once_at_any_share_of_any_number_of_iterations(
+    tmp_path, monkeypatch, iterations: int, changes: dict
+) -> None:
+    views, cameras, points, _ = case(lit=False)
+    when: list[int] = []
+    monkeypatch.setattr(Harmonics, "_spread", _noting(when, Harmonics._spread))
+    config = {"light": "none", "hold_surface": True, "iterations": iterations, **changes}
+    few = Views(views=views.views[:3])
+    here = context(tmp_path, few, cameras, points, **config)
+    FitStage().run(here)
+    assert here.figures["iterations"] == iterations * (1 + ("extension" in changes))
+    assert when == [{1: 0, 6: 5, 10: 3}[iterations]]
+
+
+def _noting(when: list[int], really):
+    def spread_at(part, fit):
+        when.append(fit.iteration)
+        really(part, fit)
+
+    return spread_at
 
 
 def test_a_stopped_fit_with_it_resumes_to_the_same_bytes(tmp_path) -> None:

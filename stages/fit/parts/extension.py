@@ -68,7 +68,7 @@ def structural_psnr(fit: Trainer) -> float:
     """
     found = []
     for view, target in enumerate(fit.targets):
-        factor = fit.reduction(max(fit.iteration, 1))
+        factor = fit.reduction(fit.iteration)
         colour = target[factor].colour
         _, error = fit.missing(view, factor)
         inside = colour.mask > 0

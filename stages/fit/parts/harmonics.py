@@ -77,15 +77,18 @@ class Harmonics(Part, switch="harmonics_at", on=0.3, off=0.0):
 
     class Settings(PartSettings):
         harmonics_at: AutoFloat = automatic({3: 0.0}, held=0.3, le=1)
-        """share of the iterations after which harmonics follow their neighbours' where no
-        photograph tells them; 0: never. Half of the iterations gain less (.21 dB, not .27)"""
+        """share of the iterations (before an extension) after which harmonics follow their
+        neighbours' where no photograph tells them; 0: never. Half of the iterations gain less
+        (.21 dB, not .27)"""
 
     @classmethod
     def of(cls, fit: Trainer) -> Part | None:
         return None if fit.lit else super().of(fit)
 
     def begin(self, fit: Trainer) -> None:
-        if fit.iteration == round(self.settings.harmonics_at * fit.iterations):
+        # once, however long the fit becomes, and before the last iteration
+        iterations = self.settings.iterations
+        if fit.iteration == min(round(self.settings.harmonics_at * iterations), iterations - 1):
             self._spread(fit)
 
     def _spread(self, fit: Trainer) -> None:

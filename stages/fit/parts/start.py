@@ -54,7 +54,7 @@ class Saturation(Part, absent={"saturation": 2.0}):  # above any colour
 
 
 def reduction(settings: FitSettings, iteration: int, iterations: int) -> int:
-    """By which factor images are reduced in an iteration, counted from 1, of so many.
+    """By which factor images are reduced in an iteration, counted from 1, of so many; at 0 as at 1.
 
     From ``coarse_factor`` it is halved until it is 1; what is reduced at all takes equal shares.
     """
@@ -62,7 +62,7 @@ def reduction(settings: FitSettings, iteration: int, iterations: int) -> int:
     coarse = settings.coarse_fraction * iterations
     if not factors or iteration > coarse:
         return 1
-    return factors[min(int((iteration - 1) * len(factors) / coarse), len(factors) - 1)]
+    return factors[min(int(max(iteration - 1, 0) * len(factors) / coarse), len(factors) - 1)]
 
 
 def coarse_factors(settings: FitSettings) -> list[int]:
