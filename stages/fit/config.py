@@ -70,7 +70,8 @@ class Basics(PartSettings):
     sh_degree: AutoInt = automatic({6: 1, 9: 2}, held=2, le=3)
     """degree of the spherical harmonics"""
     sh_degree_interval: Whole = 0
-    """iterations until the next degree is used; 0: all from the start (3DGS: 1000)"""
+    """iterations until the next degree is used, without a shading to start with; 0: all from the
+    start (3DGS: 1000)"""
     lambda_dssim: Share = 0.2
     """weight of 1 - SSIM against L1 in the colour loss"""
     # between many views positions are held by all: with twice the rates that few views bear,

@@ -95,7 +95,7 @@ class Trainer:
         self.resized = 0
         self.curve: Array = np.empty((0, 4))
         self.fingerprint = self._fingerprint()
-        # harmonics still to come are 0, and cost time; frames still to come bring some of their own
+        # harmonics still to come cost time; frames still to come bring some of their own
         self.narrow = not self.settings.progressive and not self.lit
         self._use_harmonics()
 
@@ -181,11 +181,11 @@ class Trainer:
         return most if every <= 0 else min(most, self.iteration // every)
 
     def _use_harmonics(self) -> None:
-        """Keep what the degree needs by now."""
+        """Add what the degree needs by now."""
         used = HARMONICS + 3 * (self.degree() + 1) ** 2
         missing = used - self.packed.shape[1]
-        if self.narrow and missing and not self.packed[:, used:].any():
-            self.packed = np.pad(self.packed[:, :used], ((0, 0), (0, max(0, missing))))
+        if self.narrow and missing > 0:
+            self.packed = np.pad(self.packed, ((0, 0), (0, missing)))
             self.adam.resize(used)
 
     def replace(self, packed: Floats, source: Indices, fresh: Bools) -> None:

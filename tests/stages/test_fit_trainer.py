@@ -36,6 +36,23 @@ def test_fit_improves_on_its_start_and_reports(tmp_path) -> None:
     assert np.mean(scores) == pytest.approx(here.figures["train_psnr"], abs=0.05)
 
 
+def test_harmonics_that_a_fit_does_not_come_to_are_not_in_the_scene(tmp_path) -> None:
+    views, cameras, points = case()
+    config = {"light": "none", "hold_surface": False, "headlight": 0.6}
+    scenes, scores = {}, {}
+    for name, changes in (
+        ("none", {"sh_degree": 0}),
+        ("later", {"sh_degree": 1, "sh_degree_interval": 1000}),
+        ("soon", {"sh_degree": 1, "sh_degree_interval": 20}),
+    ):
+        here = context(tmp_path / name, views, cameras, points, **config, **changes)
+        FitStage().run(here)
+        scenes[name], scores[name] = here.result("gaussians").sh, here.figures["train_psnr"]
+    np.testing.assert_array_equal(scenes["later"], scenes["none"])
+    assert np.any(scenes["soon"][:, 1:4])
+    assert scores["soon"] > scores["none"]
+
+
 def test_a_stopped_fit_resumes_to_the_same_bytes_with_any_number_of_threads(tmp_path) -> None:
     views, cameras, points = case()
     config = {"densify": True, "densify_from_iter": 20, "densification_interval": 10,

@@ -60,10 +60,12 @@ class Scene:
         cloud, packed = None, np.empty((0, 14), np.float32)
         if not settings.progressive:
             cloud = self.start(settings)
+            # a shading that is not drawn yet would not be fitted either
+            plain = lit or settings.sh_degree_interval > 0
             packed = initial_gaussians(
                 cloud, self.cameras, opacity=settings.initial_opacity,
                 scale=settings.initial_scale, scale_max_px=settings.initial_scale_max_px,
-                degree=0 if lit else settings.sh_degree, headlight=settings.headlight,
+                degree=0 if plain else settings.sh_degree, headlight=settings.headlight,
                 shoulder=settings.headlight_shoulder,
             )  # fmt: skip
         extent, middle = self.extent()
