@@ -53,6 +53,20 @@ def test_harmonics_that_a_fit_does_not_come_to_are_not_in_the_scene(tmp_path) ->
     assert scores["soon"] > scores["none"]
 
 
+def test_opacities_that_start_anew_are_no_divergence_and_have_time_to_come_back(tmp_path) -> None:
+    views, cameras, points = case()
+    config = {"densify": True, "light": "none", "hold_surface": False}
+    here = context(
+        tmp_path, views, cameras, points, iterations=320, opacity_reset_interval=160, **config
+    )
+    losses: list[float] = []
+    here.on_progress = lambda step, done, total, **figures: losses.append(figures.get("loss", 0))
+    FitStage().run(here)
+    grown = np.diff(losses) > 0.1
+    assert grown.sum() == 1 and grown[16]  # at 160, and not at the end
+    assert here.figures["train_psnr"] > 30  # 33.3; 36.1 without
+
+
 def test_a_stopped_fit_resumes_to_the_same_bytes_with_any_number_of_threads(tmp_path) -> None:
     views, cameras, points = case()
     config = {"densify": True, "densify_from_iter": 20, "densification_interval": 10,

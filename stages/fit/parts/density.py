@@ -36,7 +36,7 @@ SETTLE = 100
 
 class Density(
     Part, switch="densify", on=True, off=False,
-    kept=("statistics.signed", "statistics.absolute", "statistics.seen"),
+    kept=("statistics.signed", "statistics.absolute", "statistics.seen", "latest"),
 ):  # fmt: skip
     """Large gradients on the screen decide on clones and splits.
 
@@ -67,7 +67,8 @@ class Density(
         max_gaussians: AutoInt = automatic({3: 15000, 6: 60000}, ge=1)
         """densification stops here; the largest gradients come first"""
         opacity_reset_interval: Whole = 3000
-        """iterations between opacity resets; 0: never"""
+        """iterations between opacity resets, while densification goes on, and at least so many from
+        the last one to the end; 0: never"""
         prune_opacity: Annotated[float, Field(gt=0, lt=0.5)] = 0.005
         """Gaussians below this opacity are removed"""
 
@@ -80,10 +81,20 @@ class Density(
         wanted = "mcmc" if cls.name == "mcmc" else "default"
         return super().of(fit) if fit.settings.strategy == wanted else None
 
+    def until(self, fit: Trainer) -> int:
+        """The last iteration of densification."""
+        return self.settings.densify_until_iter + fit.iterations - self.settings.iterations
+
     def due(self, fit: Trainer) -> bool:
         s, now = self.settings, fit.iteration
-        until = s.densify_until_iter + fit.iterations - s.iterations
-        return s.densify_from_iter <= now <= until and now % s.densification_interval == 0
+        within = s.densify_from_iter <= now <= self.until(fit)
+        return within and now % s.densification_interval == 0
+
+    def reset_due(self, fit: Trainer) -> bool:
+        """Whether opacities start anew now, with time to come back."""
+        now, every = fit.iteration, self.settings.opacity_reset_interval
+        last = min(self.until(fit), fit.iterations - every)
+        return every > 0 and now % every == 0 and now <= last
 
     def populate(self, fit: Trainer, step: Step) -> None:
         s = self.settings
@@ -101,7 +112,8 @@ class Density(
             )  # fmt: skip
             keep = fit.packed[:, 10] > logit(s.prune_opacity)
             fit.replace(*numerics.density.grow(fit.packed, clone, split, keep, fit.random))
-        if s.opacity_reset_interval > 0 and fit.iteration % s.opacity_reset_interval == 0:
+        if self.reset_due(fit):
+            self.latest = fit.iteration
             ceiling = np.float32(logit(2 * s.prune_opacity))
             fit.packed[:, 10] = np.minimum(fit.packed[:, 10], ceiling)
             fit.adam.first[:, 10] = 0
