@@ -99,6 +99,16 @@ def test_a_view_adds_gaussians_where_it_shows_something_new(tmp_path) -> None:
     assert (pixels[:, 0] < cameras[2].width + 4).all()  # nothing that no view sees
 
 
+def test_views_that_are_still_to_be_placed_say_nothing_of_how_right_a_fit_is(tmp_path) -> None:
+    truth = [looking(0.15 * step, f"{step:03d}") for step in range(4)]
+    here = context(
+        tmp_path, painted(truth), Cameras(tuple(truth)), surface(), iterations=120, extension=0.5,
+        **PROGRESSIVE,
+    )  # fmt: skip
+    FitStage().run(here)
+    assert here.figures["extension"] == 0
+
+
 def test_a_stopped_progressive_fit_resumes_to_the_same_bytes(tmp_path) -> None:
     views, cameras, points = case()
     config = {**PROGRESSIVE, "progressive_pose_iterations": 10, "densify": True,

@@ -130,8 +130,8 @@ def unexplained(fit: Trainer, factor: int, times: float, least: float) -> tuple[
         each. And the largest area that it colours in a single view, in pixels at full size.
     """
     excess, seen = np.zeros((2, len(fit.packed)))
-    for view, target in enumerate(fit.targets):
-        colour = target[factor].colour
+    for view in fit.views:
+        colour = fit.targets[view][factor].colour
         rendering, error = fit.missing(view, factor)
         own = noise_level(colour.target.mean(0), colour.mask)
         noise = max(times * own, least)

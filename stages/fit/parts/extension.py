@@ -62,14 +62,14 @@ class Extension(Part, switch="extension", off=0.0, kept=("share",)):
 
 
 def structural_psnr(fit: Trainer) -> float:
-    """How well a fit explains its photographs, in dB: the mean over the views.
+    """How well a fit explains its photographs, in dB: the mean over the views that take part.
 
     By what is left of them when each channel has its best gain and bias, and noise is taken off.
     """
     found = []
-    for view, target in enumerate(fit.targets):
+    for view in fit.views:
         factor = fit.reduction(fit.iteration)
-        colour = target[factor].colour
+        colour = fit.targets[view][factor].colour
         _, error = fit.missing(view, factor)
         inside = colour.mask > 0
         unexplained = [
