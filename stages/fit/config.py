@@ -143,6 +143,11 @@ class FitConfig(
                 "progressive works with light none, hold_surface false, lambda_flow 0 and "
                 "strategy default only"
             )
+        if self.isotropic and (self.hold_surface is not False or self.detail):
+            raise ValueError(
+                "isotropic works with hold_surface false and detail false only: held Gaussians are "
+                "flat, and detail splits them along some of their axes"
+            )
         return self
 
 

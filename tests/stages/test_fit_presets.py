@@ -90,6 +90,14 @@ def test_a_method_has_the_parts_that_it_names() -> None:
         FitConfig(parts=["poses", "light_house"])
 
 
+def test_isotropic_is_refused_with_what_makes_gaussians_flat_or_long() -> None:
+    for other in ({}, {"detail": False}, {"hold_surface": False}):
+        with pytest.raises(ValidationError, match="isotropic works with"):
+            FitConfig(isotropic=True, **other)
+    FitConfig(isotropic=True, hold_surface=False, detail=False)
+    assert FitConfig(parts=["isotropic", "density"]).isotropic
+
+
 def test_every_setting_says_what_it_means_and_what_auto_is() -> None:
     for name, field in FitConfig.model_fields.items():
         assert field.description, name

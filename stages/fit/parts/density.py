@@ -155,7 +155,7 @@ class Isotropic(Part, switch="isotropic", on=True, off=False):
 
     class Settings(PartSettings):
         isotropic: bool = False
-        """keep the three scales of each Gaussian equal"""
+        """keep the three scales of each Gaussian equal (with hold_surface and detail false only)"""
 
     @classmethod
     def of(cls, fit: Trainer) -> Part | None:
