@@ -25,7 +25,7 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Whole = Annotated[int, Field(ge=0)]
 Pair = tuple[float, float]
-Colour = tuple[float, float, float]
+Colour = tuple[Share, Share, Share]
 if TYPE_CHECKING:  # code meets settings whose "auto" has become a value
     AutoBool = bool
     AutoInt = int

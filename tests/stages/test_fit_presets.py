@@ -90,6 +90,12 @@ def test_a_method_has_the_parts_that_it_names() -> None:
         FitConfig(parts=["poses", "light_house"])
 
 
+def test_a_background_is_a_colour_in_0_to_1() -> None:
+    assert FitConfig(background=(1, 0.5, 0)).background == (1, 0.5, 0)
+    with pytest.raises(ValidationError, match="less than or equal to 1"):
+        FitConfig(background=(255, 255, 255))
+
+
 def test_isotropic_is_refused_with_what_makes_gaussians_flat_or_long() -> None:
     for other in ({}, {"detail": False}, {"hold_surface": False}):
         with pytest.raises(ValidationError, match="isotropic works with"):
