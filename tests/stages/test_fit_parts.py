@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +20,10 @@ from stages.fit.inputs.initial import (
 from stages.fit.inputs.scene import out_of_place, trusted_points
 from stages.fit.inputs.targets import Target, make_target
 from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
-from stages.fit.parts.camera import Background, SharedFocal
+from stages.fit.parts.camera import Background, Focal, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
 from stages.splatting.harmonics import harmonics
+from stages.splatting.rasterizer import Viewpoint, rasterize
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -196,10 +198,42 @@ def test_the_shared_focal_walks_to_where_its_gradient_ends() -> None:
     intrinsics = np.array([100, 120, 50, 40], np.float32)
     for _ in range(400):
         used = focal.apply(intrinsics)
-        focal.step(np.array([used[0] - 104.0, 0.0]), used, 1e-3)
+        focal.step(float((used[0] - 104.0) * used[0]), 1e-3)
     assert focal.apply(intrinsics)[0] == pytest.approx(104, abs=0.2)
     assert focal.apply(intrinsics)[1] == pytest.approx(124.8, abs=0.3)
     assert focal.apply(intrinsics)[2:].tolist() == [50, 40]
+
+
+def test_the_shared_focal_is_that_of_both_views_between_which_there_is_flow() -> None:
+    packed = packed_scene(40)
+    packed[:, :3] *= 0.5
+    packed[:, 2] += 4
+    pose = np.eye(4, dtype=np.float32)[:3]
+    further = pose.copy()
+    further[0, 3] = 1.5
+    lens = np.array([60, 70, 30, 22], np.float32)
+    weights = np.random.default_rng(1).uniform(0.5, 1, (44, 60)).astype(np.float32)
+
+    def drawn(log_factor: float):
+        wider = lens * np.exp([log_factor, log_factor, 0, 0]).astype(np.float32)
+        here, there = (Viewpoint(p, wider, 60, 44) for p in (pose, further))
+        options = {"degree": 0, "near": 0.1, "alpha_cut": 1e-4}
+        return rasterize(packed, here, flow_to=there, **options), here, there
+
+    def value(log_factor: float) -> float:
+        return float((drawn(log_factor)[0].planes[3] * weights).sum(dtype=np.float64))
+
+    rendering, here, there = drawn(0.0)
+    by_planes = np.zeros_like(rendering.planes)
+    by_planes[3] = weights
+    gradients = rendering.backward(by_planes, np.zeros_like(weights))
+    asked: list[float] = []
+    fit: Any = SimpleNamespace(
+        settings=FitConfig(), focal=SimpleNamespace(step=lambda by, rate: asked.append(by))
+    )
+    step: Any = SimpleNamespace(gradients=gradients, viewpoint=here, following=there)
+    Focal(fit).follow(fit, step)
+    assert asked[0] == pytest.approx((value(0.01) - value(-0.01)) / 0.02, rel=0.02)
 
 
 def test_a_surface_is_held_where_few_views_are_far_apart() -> None:

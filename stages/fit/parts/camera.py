@@ -166,8 +166,11 @@ class Focal(Part, switch="optimize_focal", on=True, off=False):
         """learning rate of that factor's logarithm"""
 
     def follow(self, fit: Trainer, step: Step) -> None:
-        rate = self.settings.focal_lr
-        fit.focal.step(step.gradients.focal, step.viewpoint.intrinsics, rate)
+        found = [(step.gradients.focal, step.viewpoint)]
+        if step.following is not None:  # flow leads from one view to another, and both have it
+            found.append((step.gradients.next_focal, step.following))
+        by_log = sum(float(by @ view.intrinsics[:2].astype(np.float64)) for by, view in found)
+        fit.focal.step(by_log, self.settings.focal_lr)
 
 
 class PoseOptimizer:
@@ -227,9 +230,8 @@ class SharedFocal:
         factor = np.float32(np.exp(self.log_factor))
         return intrinsics * np.array([factor, factor, 1, 1], np.float32)
 
-    def step(self, gradient: Array, intrinsics: Floats, rate: float) -> None:
-        """Move against the gradient [2] of fx and fy of a view whose intrinsics [4] were used."""
-        by_log = float(gradient @ intrinsics[:2].astype(np.float64))
+    def step(self, by_log: float, rate: float) -> None:
+        """Move against the gradient by the factor's logarithm."""
         self.steps += 1
         move, self.first, self.second = numerics.moments.adam_step(
             by_log, self.first, self.second, self.steps, rate
