@@ -334,7 +334,8 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
         )
     about = _description(model, location)
     return (
-        f"{dotted}={shown(error.get('input'))} is not allowed: {error['msg']}."
+        f"{dotted}={shown(error.get('input'))} is not allowed: "
+        f"{error['msg'].removeprefix('Value error, ')}."
         f"{f' It means: {about}' if about else ''}"
     )
 
