@@ -26,8 +26,8 @@ INK, FAINT = "#010203", "#040506"
 PAGE_COLORS = {INK: "currentColor", FAINT: "var(--line)"}
 #: Series colours that tell apart for the colour-blind (Okabe and Ito), on light and dark pages.
 SERIES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8a8a8a")
-#: Letters of a line of a legend in two columns.
-WIDEST_NAME = 22
+#: Letters of a line of a method's name in a legend, and of a photograph's name beside a matrix.
+WIDEST_NAME, WIDEST_PHOTO = 22, 16
 #: Ratio of largest to least value from which on a logarithmic axis has enough ticks.
 WIDE_RANGE = 20
 #: Pixels along the long side of the picture of the points under the cameras.
@@ -103,6 +103,17 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def _broken(name: str) -> str:
+    """A name on two lines at most."""
+    return fill(_plain(name), WIDEST_NAME, max_lines=2, placeholder=" …")
+
+
+def _ends(name: str) -> str:
+    """Beginning and end of a name; where it is too long, what is between them is left out."""
+    half = WIDEST_PHOTO // 2
+    return _plain(name if len(name) <= WIDEST_PHOTO else f"{name[: half - 1]}…{name[-half:]}")
+
+
 def _for_the_page(text: str, alt: str) -> str:
     from markupsafe import escape
 
@@ -142,13 +153,14 @@ def match_matrix(names: Sequence[str], table: Mapping[tuple[int, int], int]) -> 
     for (i, j), value in table.items():
         counts[i, j] = counts[j, i] = value
 
-    shown_names = [_plain(name) for name in names]
+    shown_names = [_ends(name) for name in names]
+    upright = count > 6 or max(map(len, names), default=0) > 4
 
     def paint(axes: Axes) -> None:
         axes.grid(visible=False)
         shown = np.log10(np.maximum(counts, 0) + 1)
         axes.imshow(shown, cmap="YlGnBu", vmin=0, vmax=max(1.0, np.nanmax(shown, initial=0)))
-        axes.set_xticks(range(count), shown_names, rotation=90 if count > 6 else 0)
+        axes.set_xticks(range(count), shown_names, rotation=90 if upright else 0)
         axes.set_yticks(range(count), shown_names)
         axes.tick_params(length=0, labelsize=10 if count <= 14 else 7)
         if count <= 14:
@@ -319,8 +331,7 @@ def series_chart(
                     x, [values[k] for k in x], ls=style, color=color[name], lw=1.6, ms=5,
                     marker=marks[names.index(name) % len(marks)],
                     markerfacecolor=color[name] if style == "-" else "none",
-                    label=fill(_plain(name), WIDEST_NAME, max_lines=3, placeholder=" …")
-                    if style == "-" or name not in series else None,
+                    label=_broken(name) if style == "-" or name not in series else None,
                 )  # fmt: skip
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])
@@ -361,7 +372,7 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, caption: str = "") -> C
                 axes.annotate("failed", (0, row), (4, 0), textcoords="offset points", va="center")
             if bar.other is not None:
                 axes.plot([bar.other] * 2, [row - 0.42, row + 0.42], color=SERIES[1], lw=3)
-        axes.set_yticks(range(len(bars)), [_plain(bar.name) for bar in bars])
+        axes.set_yticks(range(len(bars)), [_broken(bar.name) for bar in bars])
         axes.set_ylim(len(bars) - 0.4, -0.6)
         axes.set_xlabel(label)
         axes.grid(visible=False, axis="y")

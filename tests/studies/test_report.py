@@ -31,7 +31,7 @@ from pipeline.running.outcomes import RunSummary
 from pipeline.studies.report import run_report
 from stages.evaluate.images.pictures import comparison
 from stages.flow.report import flow_colors
-from tests.browser import browse, needs_chromium
+from tests.browser import browse, needs_chromium, run_in
 from tests.studies import report_case as case
 from tests.studies.report_page import assert_alone, look, text_of
 
@@ -96,6 +96,33 @@ def test_dollars_in_names_are_no_formula() -> None:
         bar_chart([Bar(name, 1.0)], "x", "bars"),
     ):
         assert f">{name}<" in chart.svg, chart.alt
+
+
+@needs_chromium
+def test_long_names_in_charts_can_be_read(tmp_path: Path) -> None:
+    """No label lies on another or beyond the chart's edge."""
+    long = "20240513_frontal_retracted_view_IMG"
+    charts = [bar_chart([Bar(f"{long}_{k}", 1.0 + k) for k in range(3)], "x", "bars")]
+    for count, start in ((3, "left_buccal"), (6, "IMG_12"), (3, long), (12, long)):
+        pairs = {(i, j): i + j for i in range(count) for j in range(i)}
+        charts.append(match_matrix([f"{start}_{k}" for k in range(count)], pairs))
+    script = """
+      const apart = (a, b) => a.right <= b.left + 1 || b.right <= a.left + 1
+        || a.bottom <= b.top + 1 || b.bottom <= a.top + 1;
+      tell({ charts: [...document.querySelectorAll("svg")].map((chart) => {
+        const edge = chart.getBoundingClientRect();
+        const names = [...chart.querySelectorAll("text")].filter((text) =>
+          /[a-z]/i.test(text.textContent)).map((text) => text.getBoundingClientRect());
+        return [names.length, names.filter((at) => at.left < edge.left - 1 || at.top < edge.top - 1
+          || at.right > edge.right + 1 || at.bottom > edge.bottom + 1).length,
+          names.filter((at, k) => names.slice(k + 1).some((other) => !apart(at, other))).length];
+      }) });"""
+    page = "<!doctype html><meta charset=utf-8><body style='font-family: system-ui'>"
+    page += "".join(chart.svg for chart in charts) + "</body>"
+    told, log = run_in(page, script, tmp_path, (1280, 900))
+    assert log == []
+    assert [wrong for _, *wrong in told["charts"]] == [[0, 0]] * 5
+    assert [count for count, *_ in told["charts"][1:]] == [6, 12, 6, 24]
 
 
 @pytest.mark.parametrize(
