@@ -31,15 +31,18 @@ def level(index: int) -> int:
 
 def film(
     path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96),
-    coded: str = "", bars: int = 0,
+    coded: str = "", bars: int = 0, pixel: Fraction | None = None,
 ) -> Path:  # fmt: skip
     """Write a film whose frame n is of brightness `level(n)`, red at the top left.
 
-    `coded` are options of x264, `bars` the widths of black ones on the left and right.
+    `coded` are options of x264, `bars` the widths of black ones on the left and right, `pixel` is
+    the width of a pixel over its height.
     """
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=Fraction(25))
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        if pixel is not None:
+            stream.codec_context.sample_aspect_ratio = pixel
         if codec == "libx264":
             stream.options = {"crf": "10", "threads": "1", "x264-params": coded}
         else:
@@ -140,6 +143,27 @@ def test_display_matrix(
     assert corner[1] < 0.3
     x, y, _ = view.working_from_source @ (0.5, 0.5, 1)
     np.testing.assert_array_equal(view.image[int(y), int(x)], corner)
+
+
+@pytest.mark.parametrize(
+    ("codec", "name", "pixel", "size"),
+    [
+        ("libx264", "x.mp4", Fraction(4, 3), (213, 96)),  # from the key frames
+        ("mpeg4", "x.avi", Fraction(4, 3), (213, 96)),  # in one go
+        ("libx264", "x.mp4", Fraction(2, 3), (160, 144)),
+        ("libx264", "x.mp4", Fraction(200, 1), (160, 96)),  # no film is so
+    ],
+)
+def test_pixels_that_are_not_square_are_made_so(
+    tmp_path: Path, codec: str, name: str, pixel: Fraction, size: tuple[int, int]
+) -> None:
+    path = film(tmp_path / name, count=4, codec=codec, pixel=pixel)
+    views, _ = run_stage(tmp_path / "out", path)
+    assert {(view.width, view.height) for view in views.views} == {size}
+    assert {view.source_size for view in views.views} == {size}
+    red = views.views[0].image[..., 0] > 0.8
+    assert red.any(0).sum() == pytest.approx(48 * size[0] / 160, abs=2)
+    assert red.any(1).sum() == pytest.approx(32 * size[1] / 96, abs=2)
 
 
 def run_stage(folder: Path, path: Path, **settings: Any) -> tuple[Any, LocalContext]:

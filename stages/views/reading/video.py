@@ -25,7 +25,7 @@ Used = TypeVar("Used")
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """One frame on its stored pixel grid.
+    """One frame as it is stored, but for pixels that are not square: these are made so.
 
     Attributes:
         index: number of the frame in the film, from 0.

@@ -23,6 +23,9 @@ from stages.views.sampling import uniform_indices
 WITH_INDEX = ("mov", "matroska")
 #: Pixels of the long side of a glance.
 GLANCE = 64
+#: Pixels of a film are this much wider than high, or higher than wide, at most: 4/3 on tapes and
+#: cards of camcorders, 2.9 where half the columns were left out. More is damage.
+WIDEST_PIXEL = 4.0
 #: Frames to glance at for each that is wanted, at most, and key frames, at least.
 GLANCES, FEWEST_KEYS = 8, 0.75
 
@@ -138,12 +141,20 @@ def _opened(container: Any, threads: int) -> Any:
     return stream
 
 
-def _reply(index: int, frame: Any, start: float) -> Reply:
-    """Frame number `index` of a film whose first is shown at `start` seconds."""
+def _shown_size(stream: Any, frame: Any) -> tuple[int, int]:
+    """(width, height) at which players show a frame: with square pixels, none of them lost."""
+    aspect = float(stream.sample_aspect_ratio or 1)
+    if not 1 / WIDEST_PIXEL <= aspect <= WIDEST_PIXEL:
+        aspect = 1.0
+    return round(frame.width * max(aspect, 1)), round(frame.height / min(aspect, 1))
+
+
+def _reply(index: int, frame: Any, start: float, size: tuple[int, int]) -> Reply:
+    """Frame number `index`, at this size, of a film whose first is shown at `start` seconds."""
     seconds = frame.time - start if frame.time is not None else index
     turn = orientation_from_rotation(frame.rotation)
     values = {"index": index, "orientation": turn, "seconds": round(float(seconds), 6)}
-    return values, [np.ascontiguousarray(frame.to_ndarray(format="rgb24"))]
+    return values, [np.ascontiguousarray(frame.reformat(*size, "rgb24").to_ndarray())]
 
 
 def _glance(
@@ -208,13 +219,14 @@ def _decode_from_keys(
                 frame, at = next(frames, None), at + 1
                 if frame is None or frame.is_corrupt or frame.pts != contents.shown[at]:
                     return False
-                check_size(frame.width, frame.height)
+                size = _shown_size(stream, frame)
+                check_size(*size)
                 if at == 0:
-                    yield {"size": [frame.width, frame.height]}, []
+                    yield {"size": [*size]}, []
                     start = frame.time or 0.0
                 if at % 10 == 0:
                     yield {"done": at + 1, "of": contents.count}, []
-            yield _reply(index, frame, start)
+            yield _reply(index, frame, start, size)
     return True
 
 
@@ -224,13 +236,15 @@ def _decode(
     """The frames at `indices`; returns how many the film has."""
     chosen, start, index = set(indices), 0.0, -1
     with opened_film(file) as container:
-        for index, frame in enumerate(container.decode(_opened(container, threads))):
-            check_size(frame.width, frame.height)
+        stream = _opened(container, threads)
+        for index, frame in enumerate(container.decode(stream)):
+            size = _shown_size(stream, frame)
+            check_size(*size)
             if index == 0:
-                yield {"size": [frame.width, frame.height]}, []
+                yield {"size": [*size]}, []
                 start = frame.time or 0.0
             if index in chosen:
-                yield _reply(index, frame, start)
+                yield _reply(index, frame, start, size)
             if index % 10 == 0:
                 yield {"done": min(index + 1, count), "of": count}, []
     return index + 1
