@@ -21,17 +21,20 @@ def orbit(angles):
     return poses
 
 
-def make_scene(angles, count=400, noise=0.3, false_share=0.2, seed=0):
-    """Matches among all views of points on a bumpy surface, with noise and false matches."""
+def make_scene(angles, count=400, noise=0.3, false_share=0.2, seed=0, zoom=()):
+    """Matches among all views of points on a bumpy surface, with noise and false matches.
+
+    `zoom` is a factor of the focal length of each view.
+    """
     rng = np.random.default_rng(seed)
     flat = rng.uniform(-1, 1, (count, 2)) * (1.6, 1.1)
     depth = 0.5 * np.sin(2 * flat[:, 0]) * np.cos(3 * flat[:, 1]) - 0.4 * flat[:, 0] ** 2
     points = np.column_stack([flat, depth])
     poses = orbit(angles)
     pixels = []
-    for pose in poses:
+    for pose, factor in zip(poses, zoom or [1.0] * len(poses), strict=True):
         local = points @ pose[:3, :3].T + pose[:3, 3]
-        exact = local[:, :2] / local[:, 2:] * FOCAL + (WIDTH / 2, HEIGHT / 2)
+        exact = local[:, :2] / local[:, 2:] * FOCAL * factor + (WIDTH / 2, HEIGHT / 2)
         pixels.append(exact + rng.normal(0, noise, exact.shape))
     correspondences = {}
     for i in range(len(poses)):

@@ -44,6 +44,20 @@ def test_an_unplaced_photograph_is_named_with_its_best_match():
     assert "no more than 20 degrees" in text
 
 
+def test_matches_by_chance_may_be_of_another_thing_and_many_are_no_wide_angle():
+    for inliers, said, unsaid in (
+        (12, "or one shows something else", "few spots"),
+        (120, "more than 35 degrees apart.", "something else"),
+        (220, "So few spots are in photographs that are small", "35 degrees"),
+    ):
+        edges = {(0, 1): two_view(200), (1, 2): two_view(inliers, 0.4)}
+        (text,) = warnings_of(
+            Attempt(solution([0, 1]), evidence(edges=edges, linked=[(0, 1)]), True, True), NAMES
+        )
+        assert said in text
+        assert unsaid not in text
+
+
 def test_a_blurred_photograph_is_called_so():
     blurred = evidence(keypoints=(900, 900, 120))
     (text,) = warnings_of(Attempt(solution([0, 1]), blurred, True, True), NAMES)

@@ -20,7 +20,8 @@ from stages.init.sfm.matching.two_view import (
     trusted_edges,
     verify_pair,
 )
-from stages.init.sfm.options import ClassicalOptions
+from stages.init.sfm.options import ClassicalOptions, RefinementOptions
+from stages.init.sfm.refine import refine_solution, with_zoomed
 from stages.init.sfm.solver import Solver, known_focal, unknown_focal
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, orbit, worst_rotation
 
@@ -150,6 +151,22 @@ def test_a_known_focal_length_is_refined_and_left_only_for_a_good_reason(tmp_pat
         solver = Solver(replace(given, lenses=[lens]), ClassicalOptions(), 1.0, 0, 1, tmp_path)
         solution = known_focal(solver, True, lambda *_: None)
         assert solution.focals[0] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("focal", [None, FOCAL])
+def test_a_photograph_with_another_zoom_gets_a_lens_of_its_own(tmp_path, focal):
+    for zoom in ([1, 1, 1.4, 1, 1], [1, 1, 0.8, 1, 1], [1] * 5):
+        given, poses = make_scene([-25, -12, 0, 12, 25], zoom=zoom)
+        lens = replace(given.lenses[0], focal=focal)
+        solver = Solver(replace(given, lenses=[lens]), ClassicalOptions(), 1.0, 0, 1, tmp_path)
+        ratio = FOCAL / lens.long_side
+        alike = refine_solution(solver, solver.solve_ratio(ratio, True), True, RefinementOptions())
+        apart, found = with_zoomed(solver, alike, True, RefinementOptions())
+        assert len(apart.given.lenses) == (1 if zoom == [1] * 5 else 2)
+        for view, factor in enumerate(zoom):
+            assert found.focals[view] == pytest.approx(FOCAL * factor, rel=0.04)
+        assert worst_rotation(found, poses) < 0.3
+        assert with_zoomed(solver, alike, False, RefinementOptions()) == (solver, alike)
 
 
 def solution_with(views, error):

@@ -32,6 +32,11 @@ HOW_TO_GIVE_FOCAL = (
 #: Photographs of teeth that are turned by no more than this against each other, in degrees, are
 #: linked; those from 40 on hardly ever (see `TwoView.evidence`).
 LINKED_UP_TO = 35
+#: Share of the spots that look alike which agree by chance, at most: 6 % where one photograph shows
+#: a house and the other a mouth, 3 to 8 % where both show one mouth from too far apart.
+BY_CHANCE = 0.1
+#: Share from which on two photographs are near enough: it is spots that they lack.
+NEAR_ENOUGH = 0.5
 #: A photograph with less than this share of the spots that the others show is a bad one.
 BLURRED = 0.4
 #: Gaps and photographs that are explained one by one.
@@ -311,16 +316,20 @@ def _best_pair(evidence: Evidence, pairs: list[Pair]) -> Pair | None:
 
 
 def _link(evidence: Evidence, names: list[str], pair: Pair, unsharp: Sequence[int]) -> str:
-    """What a pair that does not link has, and how far apart sharp ones are for that."""
+    """What a pair that does not link has, and what that means where both are sharp."""
     matches = evidence.matches[pair]
     edge = evidence.edges.get(pair)
     agreeing = len(edge.inliers) if edge else 0
-    share = 100 * agreeing / max(matches, 1)
-    apart = f" They are probably more than {LINKED_UP_TO} degrees apart."
+    share = agreeing / max(matches, 1)
+    if share >= NEAR_ENOUGH:
+        why = " So few spots are in photographs that are small, or hardly show any detail."
+    else:
+        why = f" They are probably more than {LINKED_UP_TO} degrees apart"
+        why += ", or one shows something else and is to be left out." if share < BY_CHANCE else "."
     return (
         f"'{names[pair[0]]}' and '{names[pair[1]]}' share too little: {matches} spots look alike, "
-        f"of which {agreeing} ({share:.0f} %) agree on where the camera stood."
-        f"{'' if {*pair} & {*unsharp} else apart}"
+        f"of which {agreeing} ({100 * share:.0f} %) agree on where the camera stood."
+        f"{'' if {*pair} & {*unsharp} else why}"
     )
 
 

@@ -44,7 +44,7 @@ from stages.init.sfm.options import (
     ClassicalOptions,
     RefinementOptions,
 )
-from stages.init.sfm.refine import refine_solution
+from stages.init.sfm.refine import refine_solution, with_zoomed
 from stages.init.sfm.solver import Progress, Solver, known_focal, unknown_focal
 
 #: Defaults of the last adjustment.
@@ -195,6 +195,7 @@ def reconstruct(
     if best is not None:
         best = solver.with_other_mapper(best, free)
         best = refine_solution(solver, best, free, refinement)
+        solver, best = with_zoomed(solver, best, free, refinement)
     progress("reconstruct", 1, 1)
     edges = solver.edges_used(best)
     used = [pair for pair in best.edges if pair in edges] if best else []

@@ -62,6 +62,10 @@ class Solver:
         self._verified: dict[tuple[float | None, ...], dict[Pair, TwoView]] = {}
         self._last: dict[Pair, TwoView] = {}
 
+    def on(self, given: MappingInput) -> Solver:
+        """Another one of the same settings."""
+        return Solver(given, self.options, self.pixel, self.seed, self.threads, self.scratch)
+
     def solve_ratio(self, ratio: float, free: bool) -> Solution | None:
         """`solve` with one focal length, over the long side, for all lenses."""
         return self.solve([ratio * lens.long_side for lens in self.given.lenses], free)
