@@ -24,8 +24,8 @@ LEAST_STRETCH = 0.3
 #: A photograph was taken with another zoom where a focal length of its own, with its points held,
 #: lowers its cost to this share and differs by this much. Of eleven photographs of a house, twelve
 #: frames of a scan video and twelve of a generated mouth none has less than .97, or differs by more
-#: than .008; of one that is zoomed by 1.25 to 2 among these .71 to .94, and .026 to .088: points that
-#: contradict the wrong focal length have been left out.
+#: than .008; of one that is zoomed by 1.25 to 2 among these .71 to .94, and .026 to .088: points
+#: that contradict the wrong focal length have been left out.
 ZOOMED_COST, ZOOMED_BY = 0.96, 0.015
 #: Found anew with a lens of its own, it must differ by this much: less is no other zoom.
 ANOTHER_ZOOM = 0.05
