@@ -148,6 +148,8 @@ class FitConfig(
                 "isotropic works with hold_surface false and detail false only: held Gaussians are "
                 "flat, and detail splits them along some of their axes"
             )
+        if self.extension_psnr[0] >= self.extension_psnr[1]:
+            raise ValueError("the second PSNR of extension_psnr must be higher than the first")
         return self
 
 

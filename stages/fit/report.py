@@ -73,7 +73,7 @@ def _curve(path: Path) -> dict[str, list[float]]:
 
 def _previews(folder: Path) -> list[Picture]:
     """Some of the pictures that were drawn on the way, the first and the last among them."""
-    paths = sorted(folder.glob("fit_*.png"))
+    paths = sorted(folder.glob("fit_*.png"), key=lambda path: int(path.stem[4:]))
     chosen = {round(k) for k in np.linspace(0, len(paths) - 1, MOST_PREVIEWS)} if paths else ()
     return [
         from_file(paths[k], f"Photograph and render after {int(paths[k].stem[4:])} iterations.",

@@ -96,6 +96,12 @@ def test_a_background_is_a_colour_in_0_to_1() -> None:
         FitConfig(background=(255, 255, 255))
 
 
+def test_an_extension_for_good_fits_alone_is_refused() -> None:
+    for pair in ((60, 10), (20, 20)):
+        with pytest.raises(ValidationError, match="must be higher than the first"):
+            FitConfig(extension_psnr=pair)
+
+
 def test_isotropic_is_refused_with_what_makes_gaussians_flat_or_long() -> None:
     for other in ({}, {"detail": False}, {"hold_surface": False}):
         with pytest.raises(ValidationError, match="isotropic works with"):

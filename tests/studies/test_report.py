@@ -13,6 +13,7 @@ import pytest
 
 import pipeline
 from pipeline.artifacts.metrics import Scores
+from pipeline.artifacts.pictures import Pictures
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.world import move_camera
 from pipeline.pages.charts import (
@@ -29,7 +30,9 @@ from pipeline.pages.pictures import picture, points_image, thirds
 from pipeline.pages.tables import views_table
 from pipeline.running.outcomes import RunSummary
 from pipeline.studies.report import run_report
+from pipeline.studies.report.reading import read_case
 from stages.evaluate.images.pictures import comparison
+from stages.fit.report import course
 from stages.flow.report import flow_colors
 from tests.browser import browse, needs_chromium, run_in
 from tests.studies import report_case as case
@@ -288,3 +291,13 @@ def test_a_run_that_fails_is_reported_with_its_diagnosis(tmp_path: Path) -> None
     assert failure.partition(" Pictures that")[0] in text
     assert "2 read" in text
     assert "<b>a" not in page
+
+
+def test_previews_of_a_long_fit_stand_in_the_order_of_iterations(tmp_path: Path) -> None:
+    previews = {f"fit_{n:05d}": case.picture(7) for n in (90_000, 100_000, 20)}
+    workspace = case.write_case(tmp_path / "run", ["views", "init"])
+    case.write_result(workspace, "fit", [case.cameras(), Pictures(previews)])
+    (section,) = course(read_case(workspace))
+    text = str(section)
+    places = [text.index(f"after {n} iterations") for n in (20, 90_000, 100_000)]
+    assert places == sorted(places)

@@ -27,7 +27,7 @@ LEAST_STRETCH = 0.3
 #: than .008; of one that is zoomed by 1.25 to 2 among these .71 to .94, and .026 to .088: points
 #: that contradict the wrong focal length have been left out.
 ZOOMED_COST, ZOOMED_BY = 0.96, 0.015
-#: Found anew with a lens of its own, it must differ by this much: less is no other zoom.
+#: Found anew with lenses of their own, one must differ by this much: less is no other zoom.
 ANOTHER_ZOOM = 0.05
 #: Photographs that must be placed besides: points that hang on few others bend with a wrong one.
 BESIDES_ZOOMED = 3
@@ -119,8 +119,7 @@ def with_zoomed(
     if found is None or len(found.poses) < len(best.poses) or not apart.sane(found):
         return solver, best
     found = refine_solution(apart, found, free, options)
-    usual = np.median([focal for view, focal in found.focals.items() if view not in zoomed])
-    differ = all(abs(found.focals[view] / usual - 1) > ANOTHER_ZOOM for view in zoomed)
+    differ = any(abs(found.focals[view] / best.focals[view] - 1) > ANOTHER_ZOOM for view in zoomed)
     return (apart, found) if differ else (solver, best)
 
 
