@@ -1,12 +1,13 @@
 """A closed model of a jaw with a flat base, for printing, from the surface that was seen.
 
-Photographs show a jaw from outside. What is behind that surface is made up: so much material, and a
-base that grows out of it, away from the other jaw. The seen surface itself stays where it is.
+Photographs show a jaw from outside. What is behind that surface is made up: so much material, as
+high as the crowns' edges and rounded off from there, and a base that goes on from the gum, away
+from the other jaw. The seen surface itself stays where it is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,48 +16,101 @@ from scipy import ndimage
 
 from stages.export.mesh.field import BLOCK, Field, around_blocks
 from stages.export.mesh.nets import zero_surface
-from stages.export.mesh.rims import rim_edges
-from stages.export.mesh.surface import Mesh, vertex_normals
+from stages.export.mesh.plan import Plan, plan_behind
+from stages.export.mesh.rims import even_rims, rim_edges
+from stages.export.mesh.surface import Mesh, drop_small_parts, face_normals, vertex_normals
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
 
 #: Grid points of a model, at most; beyond, voxels get larger.
 MOST_POINTS = 8_000_000
-#: A closest point with this share of border vertices lies on the border of the surface ...
+#: Faces that look so far away from the other jaw (cosine), from a rim on, are ledges: they join a
+#: crown to what bites in front of it. No photograph shows them; no crown leans out by 49 degrees.
+LEDGE = 0.75
+#: Parts of a jaw smaller than this share of its largest are not made solid.
+SMALLEST_PART = 0.05
+#: A closest point with this share of border vertices lies on the border of the surface.
 ON_BORDER = 0.999
-#: ... behind which there is material within a cone around the normal, of this cosine.
-BEHIND = 0.9
-#: How often normals are evened out for that.
+#: How often normals are evened out there.
 EVENINGS = 20
-#: What is in front of the seen surface is empty so far, as a share of the depth behind it.
-FREE = 0.5
+#: What is nearest is asked for at every so many points; divides `BLOCK`.
+COARSE = 2
+#: Points so near to the surface, in voxels, have their true distance ...
+EXACT = 2.0
+#: ... and those nearer than this are passed by it.
+PASSED = 0.75
+#: What goes on from layer to layer is evened over so many voxels, and ends within about as many.
+GOES_ON, ENDS = 1.5, 2.0
+#: Below a border means so steeply below it (cosine).
+BELOW = 0.5
 #: Made-up parts thinner than twice this many voxels are left out.
 THIN = 2
-#: The nearest surface is sought for cells of so many points a side first; divides `BLOCK`.
-COARSE = 4
-#: Points so near to the surface, in voxels, have their true distance.
-EXACT = 2.0
 #: A vertex goes back onto the seen surface if it is no further from it, in voxels.
 SNAP = 0.6
 #: The blur, in voxels, that rounds what is made up; its slope there is about 1 / 2.5 a voxel.
-BLUR, SLOPE = 1.0, 2.5
+BLUR, SLOPE = 1.5, 3.75
 #: Next to its other side a point is at least this far from the surface, in voxels.
 LEAST = 0.05
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Points of a box: `low` + index * `voxel`, y away from the other jaw."""
+    """Points of a box: `low` + index * `voxel`, y away from the other jaw.
+
+    The base ends halfway between two layers, at layer `base`; the grid goes on beyond it.
+    """
 
     low: Array
     shape: tuple[int, int, int]
     voxel: float
+    base: float
+
+    @classmethod
+    def around(cls, vertices: Array, height: float, depth: float, voxel: float) -> _Grid:
+        """A grid for the model of a surface with vertices [V, 3]; see `closed`."""
+        low, high = vertices.min(0), vertices.max(0)
+        room = np.array([2 * depth, depth + height, 2 * depth])
+        voxel = max(voxel, float(np.cbrt(np.prod(high - low + room) / MOST_POINTS)))
+        margin = depth + 3 * voxel
+        low = low - margin
+        top = high[1] + height
+        layer = int(np.ceil((top - low[1]) / voxel))
+        low[1] = top - (layer - 0.5) * voxel
+        shape = np.ceil((high + margin - low) / voxel).astype(int) + 1
+        shape[1] = layer + 4
+        x, y, z = (-(-shape // BLOCK) * BLOCK).tolist()
+        return cls(low, (x, y, z), voxel, layer - 0.5)
 
     def points(self, places: npt.NDArray) -> Floats:
         """[N, 3] of places [N, 3], which may lie between the grid's."""
         return (self.low + self.voxel * places).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """Of N points what is nearest of the seen surface.
+
+    Attributes:
+        there: [N, 3] the nearest point.
+        border: [N] whether it is on the border.
+        normal: [N, 3] there, unit; on the border that of what is around.
+        distance: [N].
+        cosine: [N] of the way from there with the normal: positive outside.
+        below: [N] whether the way from there leads away from the other jaw.
+    """
+
+    there: Array
+    border: Bools
+    normal: Array
+    distance: Array
+    cosine: Array
+    below: Bools
+
+    def __getitem__(self, chosen: Bools) -> _Nearest:
+        return _Nearest(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
 class _Seen:
@@ -77,12 +131,8 @@ class _Seen:
         )
         self.tensor = core.Tensor
 
-    def nearest(self, points: npt.NDArray[np.floating]) -> tuple[Array, Bools, Array, Array]:
-        """Of points [N, 3]: the nearest [N, 3], whether it is on the border, distance and cosine.
-
-        The cosine is that of the way from there with the normal there: positive outside. On the
-        border it is the normal of what is around.
-        """
+    def nearest(self, points: npt.NDArray[np.floating]) -> _Nearest:
+        """What is nearest to points [N, 3]."""
         asked = np.ascontiguousarray(points, np.float32)
         found = self.scene.compute_closest_points(self.tensor(asked))
         faces = self.mesh.faces[found["primitive_ids"].numpy().astype(np.int64)]
@@ -92,33 +142,26 @@ class _Seen:
         border = (self.border[faces][..., None] * shares).sum((1, 2)) > ON_BORDER
         normals = np.where(border[:, None, None], self.even[faces], self.normals[faces])
         normal = (normals * shares).sum(1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         way = points - there
         distance = np.linalg.norm(way, axis=1)
-        cosine = (way * normal).sum(1) / np.maximum(
-            distance * np.linalg.norm(normal, axis=1), 1e-12
-        )
-        return there, border, distance, cosine
+        cosine = (way * normal).sum(1) / np.maximum(distance, 1e-12)
+        return _Nearest(there, border, normal, distance, cosine, way[:, 1] > BELOW * distance)
 
-    def around(self, grid: _Grid, reach: float) -> tuple[Bools, Array, Array]:
-        """Of a grid's points whether the nearest is on the border, distance and cosine, [X, Y, Z].
-
-        Points further away than `reach`, which are most, are not looked at: they have a distance
-        of infinity.
-        """
-        cells = [size // COARSE for size in grid.shape]
-        middles = COARSE * np.indices(cells).reshape(3, -1).T + (COARSE - 1) / 2
+    def beside(self, grid: _Grid) -> tuple[Ints, _Nearest]:
+        """The places [N, 3] of a grid's points within `EXACT` voxels, and what is nearest."""
+        cells = [size // BLOCK for size in grid.shape]
+        middles = BLOCK * np.indices(cells).reshape(3, -1).T + (BLOCK - 1) / 2
         # No point of a cell is further from its middle than this.
-        within = grid.voxel * (COARSE - 1) / 2 * np.sqrt(3)
+        within = grid.voxel * (BLOCK - 1) / 2 * np.sqrt(3)
         away = self.scene.compute_distance(self.tensor(grid.points(middles))).numpy()
-        close = (away < reach + 1.01 * within).reshape(cells)
+        close = (away < EXACT * grid.voxel + 1.01 * within).reshape(cells)
         for axis in range(3):
-            close = np.repeat(close, COARSE, axis=axis)
-        border = np.zeros(grid.shape, bool)
-        distance, cosine = np.full(grid.shape, np.inf), np.zeros(grid.shape)
-        _, border[close], distance[close], cosine[close] = self.nearest(
-            grid.points(np.argwhere(close))
-        )
-        return border, distance, cosine
+            close = np.repeat(close, BLOCK, axis=axis)
+        places = np.argwhere(close)
+        found = self.nearest(grid.points(places))
+        near = found.distance < EXACT * grid.voxel
+        return places[near], found[near]
 
 
 def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None:
@@ -128,73 +171,104 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
         mesh: seen surface of a jaw; y leads away from the other jaw.
         height: of the base, beyond the surface.
         depth: of the material behind the surface.
-        voxel: of the grid in which it is made, at least. All three in units of the mesh.
+        voxel: of the grid in which it is made, at least. All three in mm, as the mesh.
 
     Returns:
         The model: watertight, with normals outwards, where the surface was seen on that surface.
         Without colours (white). None, if nothing solid comes out.
     """
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    room = np.array([2 * depth, depth + height, 2 * depth])
-    voxel = max(voxel, float(np.cbrt(np.prod(high - low + room) / MOST_POINTS)))
-    # the base ends halfway between two layers of the grid, which goes on beyond it
-    margin = np.array([depth, depth, depth]) + 3 * voxel
-    low = low - margin
-    top = high[1] + height
-    layer = int(np.ceil((top - low[1]) / voxel))  # the first beyond the base
-    low[1] = top - (layer - 0.5) * voxel
-    shape = np.ceil((high + margin - low) / voxel).astype(int) + 1
-    shape[1] = layer + 4
-    shape = -(-shape // BLOCK) * BLOCK
-    grid = _Grid(low, (int(shape[0]), int(shape[1]), int(shape[2])), voxel)
+    grid = _Grid.around(mesh.vertices, height, depth, voxel)
+    mesh = even_rims(drop_small_parts(_without_ledges(mesh), SMALLEST_PART))
+    if not len(mesh):
+        return None
     seen = _Seen(mesh)
-    border, distance, cosine = seen.around(grid, max(depth, EXACT * voxel))
-    free = (cosine > 0) & ~border & (distance < FREE * depth)
-    shell = (distance < depth) & np.where(border, cosine < -BEHIND, cosine <= 0)
-    # nothing is nearer to the other jaw than what was seen, nor goes on in front of that
-    shell &= np.arange(grid.shape[1])[:, None] >= _tops(grid, mesh.vertices, depth)[:, None]
-    last = _last(shell)
-    solid = last > _last(free)
-    base = int((high[1] - low[1]) / voxel) + 1
-    solid[:, base:] = last[:, base:] >= 0  # the base is whole
+    places, near = seen.beside(grid)
+    passed = near.distance < PASSED * grid.voxel
+    plan = plan_behind(places[passed], near.normal[passed], grid.shape, grid.voxel, depth)
+    share = _material(grid, seen, plan, depth, places, near)
+    solid = share > 0.5
+    at = tuple(places.T)
+    skin = np.zeros_like(solid)
+    skin[at] = solid[at] & ~near.border & (near.cosine <= 0)
     ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), THIN)
-    skin = solid & ~border & (cosine <= 0) & (distance < THIN * voxel)
     solid = ndimage.binary_opening(solid, ball) | skin
-    solid[:, layer:] = False
-    for axis in range(3):  # nothing touches the walls of the box
+    solid[:, 0] = False
+    for axis in (0, 2):  # nothing touches the walls of the box
         np.moveaxis(solid, axis, 0)[[0, -1]] = False
     solid = ndimage.binary_fill_holes(well_composed(_one_piece(solid)))
     if not solid.any():
         return None
-    rounded = SLOPE * ndimage.gaussian_filter(0.5 - solid.astype(np.float32), BLUR)
-    exact = ~border & (distance < EXACT * voxel)
-    values = rounded
-    values[exact] = np.sign(cosine[exact]) * distance[exact] / voxel
+    share = np.where(solid == (share > 0.5), share, solid).astype(np.float32)
+    values = SLOPE * ndimage.gaussian_filter(0.5 - share, BLUR)
+    exact = ~near.border
+    at = tuple(places[exact].T)
+    values[at] = (np.sign(near.cosine) * near.distance)[exact] / grid.voxel
     values = np.where(solid, np.minimum(values, -LEAST), np.maximum(values, LEAST))
-    plane = (np.arange(grid.shape[1]) - (layer - 0.5)).astype(np.float32)
-    values = np.maximum(values, plane[None, :, None])
-    vertices, faces = zero_surface(_field(values, voxel), 1)
-    vertices = vertices + low
-    there, on_border, away, _ = seen.nearest(vertices)
-    on_surface = ~on_border & (away < SNAP * voxel) & (vertices[:, 1] < top - voxel)
-    vertices = np.where(on_surface[:, None], there, vertices)
+    beyond = (np.arange(grid.shape[1]) - grid.base).astype(np.float32)
+    values = np.maximum(values, beyond[None, :, None])
+    vertices, faces = zero_surface(_field(values, grid.voxel), 1)
+    vertices = vertices + grid.low
+    found = seen.nearest(vertices)
+    top = grid.low[1] + grid.base * grid.voxel
+    on_surface = ~found.border & (found.distance < SNAP * grid.voxel)
+    on_surface &= vertices[:, 1] < top - grid.voxel
+    vertices = np.where(on_surface[:, None], found.there, vertices)
     return Mesh(vertices, faces, np.ones((len(vertices), 3)))
 
 
-def _last(marks: Bools) -> npt.NDArray[np.int16]:
-    """[X, Y, Z] the last layer along y, up to each point, in which its column has a mark; or -1."""
-    layers = np.arange(marks.shape[1], dtype=np.int16)[:, None]
-    return np.maximum.accumulate(np.where(marks, layers, np.int16(-1)), axis=1)
+def _without_ledges(mesh: Mesh) -> Mesh:
+    """The mesh without the faces that look away from the other jaw, from its rims on."""
+    normals = face_normals(mesh)
+    away = normals[:, 1] > LEDGE * np.linalg.norm(normals, axis=1)
+    touched = border_vertices(mesh)
+    while True:
+        ledge = away & touched[mesh.faces].any(1)
+        more = mesh.faces[ledge]
+        if touched[more].all():
+            return replace(mesh, faces=mesh.faces[~ledge])
+        touched[more] = True
 
 
-def _tops(grid: _Grid, vertices: Array, reach: float) -> npt.NDArray[np.int64]:
-    """[X, Z] the first layer in which a vertex lies within `reach` to the sides."""
-    places = ((vertices - grid.low) / grid.voxel).astype(np.int64)
-    tops = np.full((grid.shape[0], grid.shape[2]), grid.shape[1])
-    np.minimum.at(tops, (places[:, 0], places[:, 2]), places[:, 1])
-    steps = np.arange(-int(reach / grid.voxel), int(reach / grid.voxel) + 1)
-    disc = steps[:, None] ** 2 + steps**2 <= (reach / grid.voxel) ** 2
-    return ndimage.minimum_filter(tops, footprint=disc, mode="nearest")
+def _material(
+    grid: _Grid, seen: _Seen, plan: Plan, depth: float, places: Ints, near: _Nearest
+) -> Floats:
+    """[X, Y, Z] how much of each point is material, 0..1, up to the base and beyond.
+
+    Behind the surface there is what the plan says, in front of it nothing. Beyond its border, away
+    from the other jaw, goes on what was there the layer before, evened out more and more.
+
+    Args:
+        places, near: see `_Seen.beside`.
+    """
+    columns = plan.share > 0
+    width, length = (size // COARSE for size in columns.shape)
+    cells = np.asarray(columns.reshape(width, COARSE, length, COARSE).any((1, 3)))
+    asked = np.repeat(cells[:, None, :], grid.shape[1] // COARSE, axis=1)
+    found = seen.nearest(grid.points(COARSE * np.argwhere(asked) + (COARSE - 1) / 2))
+
+    def goes_on(one: _Nearest) -> Bools:
+        return (one.distance > depth) | (one.border & (one.below | (one.cosine > 0)))
+
+    def spread(values: Bools) -> Bools:
+        whole = np.zeros(asked.shape, bool)
+        whole[asked] = values
+        for axis in range(3):
+            whole = np.repeat(whole, COARSE, axis=axis)
+        return whole
+
+    going_on, free = spread(goes_on(found)), spread(~found.border & (found.cosine > 0))
+    at = tuple(places.T)
+    going_on[at], free[at] = goes_on(near), ~near.border & (near.cosine > 0)
+    slope = np.hypot(ENDS, np.sqrt(2 * np.pi) * GOES_ON) / ENDS
+    share = np.zeros(grid.shape, np.float32)
+    before = share[:, 0]
+    for layer in range(grid.shape[1]):
+        behind = np.minimum(plan.share, np.clip((layer - plan.top) / ENDS + 0.5, 0, 1))
+        even = ndimage.gaussian_filter(before, GOES_ON)
+        gone_on = np.clip(slope * (even - 0.5) + 0.5, 0, 1)
+        behind[free[:, layer]] = 0
+        before = share[:, layer] = np.where(going_on[:, layer], gone_on, behind)
+    return share
 
 
 def border_vertices(mesh: Mesh) -> Bools:

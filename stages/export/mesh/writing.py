@@ -14,7 +14,7 @@ from pipeline.artifacts.space.frames import Frame
 from pipeline.artifacts.space.scale import Scale
 from stages.export.mesh.files import faces_of, mesh_name, moved, write_mesh_ply, write_stl
 from stages.export.mesh.solid import closed, is_closed
-from stages.export.mesh.surface import Mesh, drop_small_parts, repair
+from stages.export.mesh.surface import Mesh, repair
 from stages.export.mesh.texture.atlas import TexturedMesh
 from stages.export.mesh.texture.glb import write_glb
 from stages.export.orientation import file_from_frame
@@ -24,8 +24,6 @@ Bools = npt.NDArray[np.bool_]
 
 #: Voxels in which closed models are made, mm.
 MODEL_VOXEL = 0.3
-#: Parts of a jaw smaller than this share of its largest are not made solid.
-SMALLEST_PART = 0.05
 #: Turns the lower jaw so that y leads away from the upper one.
 _LOWER_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -114,8 +112,7 @@ def write_models(
     lacking = []
     for jaw, kept in jaws.items():
         up = mouth if jaw == "upper" else _LOWER_UP @ mouth
-        surface = drop_small_parts(moved(faces_of(mesh, kept), up), SMALLEST_PART)
-        model = closed(surface, height, depth, MODEL_VOXEL)
+        model = closed(moved(faces_of(mesh, kept), up), height, depth, MODEL_VOXEL)
         if model is not None:
             # fewer triangles where it is flat, unless that opens it
             simpler = repair(model, most_faces, 0)
