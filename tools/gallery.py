@@ -20,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import open3d
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLES = ROOT / "data_samples"
@@ -90,14 +91,17 @@ def pipeline(*arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def reconstructed(name: str, work: Path, *photographs: Path) -> Path:
-    """The results of a case.
+def reconstructed(
+    name: str, work: Path, *photographs: Path, settings: tuple[str, ...] = ()
+) -> Path:
+    """The results of a case, with some settings (``--set``).
 
     Raises:
         SystemExit: it could not be made.
     """
     workspace = work / name
-    done = pipeline("run", *map(str, photographs), "-w", str(workspace))
+    said = [word for setting in settings for word in ("--set", setting)]
+    done = pipeline("run", *map(str, photographs), "-w", str(workspace), *said)
     if done.returncode:
         raise SystemExit(f"{name}: {done.stderr}")
     return workspace / "results"
@@ -135,6 +139,35 @@ def screenshot(page: Path, address: str, work: Path) -> np.ndarray:
     if picture is None:
         raise SystemExit(f"Chromium made no picture of {page}.")
     return picture
+
+
+def shaded(file: Path) -> np.ndarray:
+    """A mesh that lies on its base, z up, from the front and above: [H, W, 3] BGR."""
+    mesh = open3d.t.io.read_triangle_mesh(str(file))
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh)
+    vertices = mesh.vertex.positions.numpy().astype(np.float64)
+    centre = (vertices.min(0) + vertices.max(0)) / 2
+    eye = centre + 4 * np.linalg.norm(np.ptp(vertices, axis=0)) * np.array([0.25, -0.8, 0.55])
+    down = [0, 0, -1]  # what Open3D calls up leads down the picture
+    rays = scene.create_rays_pinhole(16, centre, eye, down, 640, 420).numpy()
+    rays[..., 3:] /= np.linalg.norm(rays[..., 3:], axis=-1, keepdims=True)
+    hit = scene.cast_rays(open3d.core.Tensor(rays))
+    normals, seen = hit["primitive_normals"].numpy(), np.isfinite(hit["t_hit"].numpy())
+    light = np.array([-0.4, -0.7, 0.6])  # of length 1
+    shade = 0.25 + 0.7 * np.clip(normals @ light, 0, 1)
+    color = np.where(seen[..., None], shade[..., None] * np.array([205, 225, 240]), 255)
+    return np.asarray(color, np.uint8)
+
+
+def models(results: Path) -> str:
+    """The section of the closed models."""
+    jaws = np.hstack([shaded(results / f"model_{jaw}.stl") for jaw in ("upper", "lower")])
+    caption = "The models of both jaws; what no photograph shows is made up."
+    return (
+        "## Models to print\n\nThe same three photographs, with `--set export.mesh_base=true`.\n\n"
+        f"![{caption}]({save(jaws, 'far_models')})\n\n{caption}\n"
+    )
 
 
 def written(photographs: list[np.ndarray] | tuple[np.ndarray, ...], folder: Path) -> Path:
@@ -213,6 +246,8 @@ def main() -> None:
     shutil.rmtree(PICTURES, ignore_errors=True)
     PICTURES.mkdir()
     frames = SAMPLES / "twelve_frames"
+    far = [frames / name for name in FAR_APART]
+    far_results = reconstructed("far", work, *far, settings=("export.mesh_base=true",))
     sections = [
         HEAD,
         scene(
@@ -228,8 +263,9 @@ def main() -> None:
         scene(
             "far", "Three photographs 45° apart",
             "Three of these frames, with the teeth as landmarks: no feature links them.",
-            reconstructed("far", work, *(frames / name for name in FAR_APART)), work, SHOTS[1:3],
+            far_results, work, SHOTS[1:3],
         ),
+        models(far_results),
         "## Refused\n\nA scene that can't be trusted is not shown. What is said instead:\n",
         *(refused(case, work) for case in refusals()),
     ]  # fmt: skip
