@@ -25,7 +25,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # data_samples and tests
 
@@ -37,7 +36,6 @@ from data_samples.mouths.options import DENTITIONS
 from data_samples.mouths.visits import CALM
 from tests.stages.measured_mouth import truth
 
-Array = npt.NDArray[np.float64]
 BITES, SHARES = ("normal", "deep", "overjet", "edge"), (0.5, 0.2, 0.2, 0.1)
 #: Degrees from the patient's left of the first and last photograph: three, and of a film.
 REACH, FILM_REACH = 44.0, 50.0

@@ -15,7 +15,7 @@ from stages.dentition.crowns import Outline, dentition_of
 
 #: Pixels of the working image, and how many of the original one of them is.
 WIDTH, HEIGHT, SCALE = 300, 200, 4
-SIDE, MARGIN = 30, 3
+SIDE = 30
 UPPER, LOWER = (13, 12, 11, 21, 22, 23), (43, 42, 41, 31, 32, 33)
 NAMES = ("0_right.jpg", "1_front.jpg", "2_<left>.jpg")
 

@@ -21,7 +21,7 @@ import tempfile
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -114,13 +114,6 @@ def _films() -> dict[str, bytes]:
                 container.mux(packet)
         films[name] = file.getvalue()
     return films
-
-
-def cases(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
-    """Damaged files: (name, bytes); the same for the same seed."""
-    names = sorted(seeds())
-    for number in range(count):
-        yield case(seed, number, names)
 
 
 def case(seed: int, number: int, names: list[str]) -> tuple[str, bytes]:

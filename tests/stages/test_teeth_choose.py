@@ -14,7 +14,6 @@ from stages.teeth.choose import ChoiceOptions, choose, chroma, layout_distance
 from stages.teeth.read import Reading, numbered, row_extent
 from tests.stages.crowns_case import SIZE, mouth
 
-FIRST = {"upper": 14, "lower": 43}
 ROWS = {"upper": (14, 13, 12, 11, 21, 22, 23), "lower": (43, 42, 41, 31, 32, 33)}
 
 

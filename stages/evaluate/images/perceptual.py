@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import torch
 
 Image = npt.NDArray[np.uint8]
-Array = npt.NDArray[np.float64]
 
 #: torchvision's file name of VGG-16 trained on ImageNet, in torch's cache.
 VGG_FILE = "vgg16-397923af.pth"

@@ -12,8 +12,6 @@ from scipy.spatial import cKDTree
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 
-Array = npt.NDArray[np.float64]
-
 #: A point is on the surface that a camera sees there if both differ by less of their depth.
 FARTHEST = 0.02
 #: A camera has a say where it looks at the surface by at least this cosine.

@@ -27,9 +27,8 @@ BLOCK = 8
 TRUNCATION = 5
 #: Bits of a block's number along one axis.
 _BITS = 21
-#: A block and its 26 neighbours; number 13 is itself.
+#: A block (number 13) and its 26 neighbours.
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
-_ITSELF = 13
 #: Vertices that get their colour at a time.
 _CHUNK = 1024
 #: The blur along one axis, of variance 1/2, and its reach.

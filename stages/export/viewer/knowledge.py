@@ -13,7 +13,6 @@ from stages.export.mesh.surface import Mesh
 from stages.splatting.rendering import RenderedView
 from stages.splatting.support import SeenSurface, seen_surface, supporting_views
 
-Array = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.floating]
 

@@ -52,7 +52,6 @@ from stages.stereo import DenseOptions, DenseView
 from stages.stereo.reconstruct import complete_depths
 
 Array = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 #: With cameras that are exact the gum can be followed this far beyond the crowns (mm), and what
 #: photographs agree on there is believed as it is on the crowns.

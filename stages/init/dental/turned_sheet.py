@@ -10,9 +10,6 @@ from pipeline.kernels import kernel
 from stages.init.dental.surface.chart.raster import draw_triangle
 from stages.init.dental.surface.dense import ArchSurface
 
-Array32 = npt.NDArray[np.float32]
-Array64 = npt.NDArray[np.float64]
-
 _BACKGROUND = 0.94
 #: The camera of the picture is this far off (mm): a little perspective, as a photograph has.
 _DISTANCE = 160.0

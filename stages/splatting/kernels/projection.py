@@ -40,7 +40,6 @@ from stages.splatting.lanes.vectors import (
 )
 
 Floats = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
 F = np.float32
 
 #: first column of the harmonics in the packed matrix

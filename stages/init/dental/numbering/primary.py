@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, teeth_of
 from pipeline.artifacts.teeth import Dentition
@@ -26,8 +25,6 @@ from stages.dentition.changing_teeth import (
 from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
 from stages.init.dental.template import tooth_at
-
-Array = npt.NDArray[np.float64]
 
 #: The permanent numbers in whose place a primary tooth can stand.
 ALL_PRIMARY = frozenset(

@@ -21,7 +21,6 @@ from stages.init.dental.surface.photos.photo import Photo
 from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 #: Narrower than twice this (mm) is no tooth, but the rim of one on a surface that is a little off.
 _NARROW = 0.5
