@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import sys
-import threading
 import time
-import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +36,7 @@ from pipeline.studies.batch.records import (
     write_case,
 )
 from pipeline.studies.batch.sources import contents_of, settings_of, with_others
-from pipeline.untrusted.names import readable
+from pipeline.studies.jobs import given_job, told_fault
 
 #: What the summary links to, where it is there: name -> place in a case's folder.
 LINKS = {
@@ -54,8 +51,7 @@ DISK_FULL = 74
 
 def main() -> None:
     """Run the job that stands in the first line of standard input."""
-    job: dict[str, Any] = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job = given_job()
     with contextlib.suppress(OSError):  # where memory runs out, this goes and not the worker
         Path("/proc/self/oom_score_adj").write_text("1000")
     private_from_now_on()
@@ -179,13 +175,7 @@ def _state_of(error: Exception) -> str:
 
 
 def _reason_of(error: Exception) -> str:
-    if isinstance(error, PipelineError):
-        return str(error)
-    where = traceback.extract_tb(error.__traceback__)[-1]
-    return readable(
-        f"A fault of ours: {type(error).__name__}: {error} ({Path(where.filename).name}, line "
-        f"{where.lineno}). Please report it."
-    )
+    return str(error) if isinstance(error, PipelineError) else told_fault(error)
 
 
 def _figures(summary: RunSummary) -> dict[str, Any]:
@@ -234,12 +224,6 @@ def _trimmed(record: dict[str, Any], job: dict[str, Any], workspace: Path) -> di
         **record, "kept": "results", "left_out": left_out, "links": _links(workspace, LINKS),
         "bytes": size_of(workspace),
     }  # fmt: skip
-
-
-def _end_with_parent() -> None:
-    """Standard input ends when the worker ends or is killed; the store survives this exit."""
-    sys.stdin.read()
-    os._exit(1)
 
 
 if __name__ == "__main__":

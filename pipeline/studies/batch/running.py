@@ -8,11 +8,9 @@ import queue
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
-
-from filelock import Timeout
 
 from pipeline.config import parse_override
 from pipeline.errors import RequestError
@@ -20,8 +18,6 @@ from pipeline.files import write_json
 from pipeline.installed import library_version
 from pipeline.measure import usable_cores
 from pipeline.process.privacy import Share, kept_for, share_for
-from pipeline.store import Store
-from pipeline.store.locks import lock_of
 from pipeline.store.places import remove, stage_folder
 from pipeline.studies.batch.cluster import check_workers, connected, require_dask, slots
 from pipeline.studies.batch.keep import thumbnail_of
@@ -37,6 +33,7 @@ from pipeline.studies.batch.records import (
 )
 from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import run_case, stop
+from pipeline.studies.jobs import only_one
 from pipeline.untrusted.names import readable
 
 Keep = Literal["workspace", "results"]
@@ -104,7 +101,11 @@ def batch(
     }  # fmt: skip
     plan = make_plan(place, folder, common["preset"], texts, named, retry, keep)
     check_folder(folder, place, plan.cases, chosen=out is not None)
-    with kept_for(share_for(folder, share)), _only_one(folder.absolute()) as home:
+    wait = "Wait for it (its summary.html shows how far it is)"
+    alone = only_one(folder.absolute(), "batch", FOLDERS, wait)
+    with kept_for(share_for(folder, share)), alone as home:
+        for name in FOLDERS:
+            stage_folder(home, name)
         plan = plan.again()  # what another batch has done meanwhile
         check_folder(folder, place, plan.cases, chosen=out is not None)
         session, version = uuid.uuid4().hex, library_version("dentalsplat")
@@ -341,23 +342,3 @@ def _memory_each(gigabytes: float | None, jobs: int, scheduler: str | None) -> i
     import psutil
 
     return int(psutil.virtual_memory().total * 0.9 / jobs)
-
-
-@contextlib.contextmanager
-def _only_one(folder: Path) -> Iterator[Path]:
-    """Make the folder and keep other batches out of it."""
-    Store(folder).create(more=FOLDERS)
-    for name in FOLDERS:
-        stage_folder(folder, name)
-    lock = lock_of(folder)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise RequestError(
-            f"Another batch is working in {folder}. Wait for it (its summary.html shows how far it "
-            "is), or choose another folder: -o."
-        ) from None
-    try:
-        yield folder
-    finally:
-        lock.release()

@@ -6,22 +6,18 @@ import contextlib
 import json
 import subprocess
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from filelock import Timeout
-
 from pipeline.config import parse_override
-from pipeline.errors import RequestError
 from pipeline.files import write_json
 from pipeline.installed import module_command
 from pipeline.measure import usable_cores
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.stage import get_stage
-from pipeline.store import Store, read_own, write_sealed
-from pipeline.store.locks import lock_of
+from pipeline.store import read_own, write_sealed
 from pipeline.store.places import remove, stage_folder
 from pipeline.studies.benchmark.cells import (
     Cell,
@@ -35,6 +31,7 @@ from pipeline.studies.benchmark.results import FORMAT, machine, versions_in_use
 from pipeline.studies.benchmark.suite import LoadedSuite, load_suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
 from pipeline.studies.benchmark.writing import write_tables
+from pipeline.studies.jobs import only_one
 
 #: How the process of one cell is started.
 WORKER = module_command("pipeline.studies.benchmark.worker")
@@ -83,7 +80,9 @@ def benchmark(
     folder = Path(out) if out is not None else Path("runs") / f"benchmark_{loaded.path.stem}"
     threads = max(1, usable_cores() // jobs)
     places = {cell.workspace.partition("/")[0] for cell in cells}
-    with kept_for(share_for(folder, share)), _only_one(folder.absolute(), places) as place:
+    alone = only_one(folder.absolute(), "benchmark", places, "Wait for it")
+    with kept_for(share_for(folder, share)), alone as place:
+        stage_folder(place, "cells")
         told = {"threads": threads, "quiet": say is None, "verbose": verbose}
         records = _run_all(cells, place, jobs, told, say or (lambda text: None))
         results = _results(loaded, cells, tables, records, machine(jobs, threads))
@@ -99,24 +98,6 @@ def _write_report(results: dict[str, Any], out: Path, say: Say) -> None:
         benchmark_report(results, out)
     except Exception as error:
         say(f"The report could not be written: {error}")
-
-
-@contextlib.contextmanager
-def _only_one(folder: Path, places: Iterable[str]) -> Iterator[Path]:
-    """Make the folder and keep other benchmarks out of it."""
-    Store(folder).create(more=places)
-    stage_folder(folder, "cells")
-    lock = lock_of(folder)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise RequestError(
-            f"Another benchmark is working in {folder}. Wait for it, or choose another folder: -o."
-        ) from None
-    try:
-        yield folder
-    finally:
-        lock.release()
 
 
 def _run_all(

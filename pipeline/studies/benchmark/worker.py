@@ -6,12 +6,7 @@ So the peak memory and the seconds of a cell are its own, imports included, and 
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-import threading
 import time
-import traceback
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +16,7 @@ from pipeline.running.outcomes import StageOutcome
 from pipeline.running.reporter import Reporter
 from pipeline.store import write_sealed
 from pipeline.studies.benchmark.cells import Cell, record_path, run_cell, unfinished_record
+from pipeline.studies.jobs import given_job, told_fault
 
 
 class CellReporter(LineReporter):
@@ -55,32 +51,20 @@ class CellReporter(LineReporter):
 
 def main() -> None:
     """Run the job that stands in the first line of standard input."""
-    job: dict[str, Any] = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job = given_job()
     cell, out = Cell.from_dict(job["cell"]), Path(job["out"])
     private_from_now_on()
     try:
         with kept_for(job["share"]):
             record = run_cell(cell, out, job["threads"], _reporter(cell, job))
     except Exception as error:  # outside of any stage; it must not leave a trace on the terminal
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        record = unfinished_record(
-            cell,
-            f"A fault of ours: {type(error).__name__}: {error} ({Path(where.filename).name}, line "
-            f"{where.lineno}). Please report it.",
-        )
+        record = unfinished_record(cell, told_fault(error))
     with kept_for(job["share"]):
         write_sealed(record_path(cell, out), record)
 
 
 def _reporter(cell: Cell, job: dict[str, Any]) -> Reporter:
     return Reporter() if job["quiet"] else CellReporter(cell, verbose=job["verbose"])
-
-
-def _end_with_parent() -> None:
-    """Standard input ends when the benchmark ends or is killed; the store survives this exit."""
-    sys.stdin.read()
-    os._exit(1)
 
 
 if __name__ == "__main__":
