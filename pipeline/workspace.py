@@ -196,9 +196,10 @@ def status(
     stages: Sequence[str] | None = None,
     verify: bool = False,
 ) -> list[StageStatus]:
-    """Compare a workspace with a request, by default the one it was last asked for.
+    """Tell each stage of a workspace: cached, stale (and why), missing or failed.
 
-    Given a preset, overrides or stages, it tells what a run with them would find stale.
+    It is compared with what it was last asked for. Given a preset, overrides or stages, it tells
+    what a run with them would find.
 
     Args:
         verify: read every byte of the results, and not only of those that seem to have changed.

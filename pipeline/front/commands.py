@@ -38,11 +38,11 @@ def run(
     ``WORKSPACE/logs`` keeps a log of each of the last runs.
 
     Args:
-        images: a folder, files, a glob pattern or one video; empty to take the `views` that the
-            workspace holds as they are, with the settings of its last run unless a preset is named.
+        images: a folder, files, a glob pattern or one video; empty to go on with those that the
+            workspace remembers, with the settings of its last run unless a preset is named.
         workspace: where results are kept; default ``./runs/<name of the input>``.
         preset: name or YAML file of a preset.
-        overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``.
+        overrides: ``{"sap.quantile": 0.99}`` or ``["sap.quantile=0.99"]``; see `settings`.
         stages: names of the stages to run, in order; default all of the preset.
         from_stage: begin here, with what the workspace holds from before.
         force: compute the stages anew although a valid result exists.
@@ -52,12 +52,15 @@ def run(
             said of the workspace already. Until the run ends, all that this process writes is kept
             from others (`pipeline.process.privacy`).
         profile: write ``profile/STAGE.html`` into the workspace for each stage that runs: where its
-            time went.
+            time went. Needs the extra ``profile``.
         reporter: hears of the progress.
 
+    Returns:
+        What each stage did, and the folder of the results (`results`).
+
     Raises:
-        RequestError: the request is wrong. ReconstructionError: the data can't be reconstructed.
-        StageError: a fault of ours.
+        RequestError: the request is wrong. ReconstructionError: the photographs can't be put
+        together; the message says why and what to do. StageError: a fault of ours.
     """
     request = make_request(
         images, workspace, preset, overrides, stages, from_stage, as_before=True

@@ -66,7 +66,7 @@ def batch(
         out: folder for workspaces and summary; default ``./runs/batch_<name of the cases>``.
         jobs: cases at a time on this machine; the cores are divided between them.
         scheduler: address or file of a Dask scheduler, to run on its workers instead.
-        preset, overrides, stages: as `pipeline.run` has them, for all cases.
+        preset, overrides, stages: as `run` has them, for all cases.
         retry: ``failed``, or names of cases: run these again though they came to an end.
         keep: ``results``: of a case that went well only these are kept, at most 8 to 12 MB.
         memory: gigabytes that the processes of one case may take; None: an equal share of the
