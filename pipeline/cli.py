@@ -303,7 +303,8 @@ def clean_command(
     as_json: AsJson = False,
 ) -> None:
     """Delete results that are not in use; what a stopped run can go on from is kept."""
-    from pipeline.workspace import checkpoints, clean
+    from pipeline.store.cleaning import checkpoints
+    from pipeline.workspace import clean
 
     folder = workspace or only_workspace()
     removed, freed = clean(folder, keep=keep, everything=everything)

@@ -12,6 +12,7 @@ from pipeline.config import anchored, load_config, yaml_value
 from pipeline.errors import PipelineError, RequestError
 from pipeline.planning import plan_chain, resolve_chain
 from pipeline.store import Store, partial_name
+from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, is_there, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
@@ -257,12 +258,7 @@ def clean(
     if not is_workspace(folder):
         raise RequestError(f"{folder} is not a workspace, so nothing in it was deleted.")
     store = Store(folder)
-    return store.clean(keep, () if everything else _useful(folder, store.checkpoints()))
-
-
-def checkpoints(workspace: str | Path) -> dict[str, int]:
-    """Name (``stage/folder``) -> bytes of what stopped runs left to go on from."""
-    return Store(Path(workspace)).checkpoints()
+    return store.clean(keep, () if everything else _useful(folder, checkpoints(folder)))
 
 
 def _useful(folder: Path, found: Iterable[str]) -> list[str]:

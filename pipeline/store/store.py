@@ -38,7 +38,7 @@ from pipeline.files import (
 from pipeline.process.privacy import share_for
 from pipeline.store import checks
 from pipeline.store.checks import mark_of
-from pipeline.store.cleaning import PARTIAL, SCRATCH, checkpoints, clean, holds_checkpoint
+from pipeline.store.cleaning import PARTIAL, SCRATCH, clean, holds_checkpoint
 from pipeline.store.failures import EVIDENCE, FAILURE, Failures
 from pipeline.store.faults import reason_of
 from pipeline.store.links import NO_LINKS, link_to
@@ -338,10 +338,6 @@ class Store:
                 f"{reason_of(error)}). Mend its permissions, or make its disk writable, and run "
                 "the same command again; what is in use was left alone."
             ) from error
-
-    def checkpoints(self) -> dict[str, int]:
-        """Name (``stage/folder``) -> bytes of what stopped runs left to go on from."""
-        return checkpoints(self.root)
 
 
 def _names(folder: Path, kinds: Iterable[str]) -> Iterator[str]:

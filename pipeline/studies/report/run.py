@@ -12,13 +12,13 @@ from typing import Any, TypeVar
 import yaml
 
 from pipeline.errors import PipelineError
+from pipeline.installed import library_version
 from pipeline.pages.anonymous import anonymous as without_names
 from pipeline.pages.case import Case, title_of
 from pipeline.pages.page import ANONYMOUS, CHECK, REPORT, seconds, write_page
 from pipeline.pages.parts import Card, Fact, Hero, Link, Part, Section
 from pipeline.pages.pictures import Picture, from_file
 from pipeline.pages.tables import costs
-from pipeline.planning import library_version
 from pipeline.stage import get_stage
 from pipeline.studies.report.check import write_check_page
 from pipeline.studies.report.compared import comparison
