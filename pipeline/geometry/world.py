@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.rigid import nearest_rotation
+from pipeline.geometry.similarity import moved_camera
 
 Array = npt.NDArray[np.float64]
 
@@ -75,8 +76,4 @@ def similarity_between(
 
 def move_camera(camera: Camera, motion: tuple[float, Array, Array]) -> Camera:
     """The camera in the world that (scale, rotation, translation) leads to, depths times scale."""
-    scale, rotation, shift = motion
-    pose = np.eye(4)
-    pose[:3, :3] = camera.rotation @ rotation.T
-    pose[:3, 3] = scale * camera.translation - pose[:3, :3] @ shift
-    return replace(camera, cam_from_world=pose)
+    return replace(camera, cam_from_world=moved_camera(camera.cam_from_world, *motion))

@@ -13,6 +13,7 @@ from pipeline.artifacts.confidence import FILLED
 from pipeline.geometry.normals import depth_normals
 from pipeline.geometry.order import nearest_views
 from pipeline.kernels import each, kernel, kernel_threads
+from stages.stereo.consistency import camera_table, stacked
 
 Array = npt.NDArray[np.float32]
 
@@ -168,17 +169,6 @@ def _fuse_row(  # type: ignore[no-untyped-def]
             color_out[y, x, q] /= total
 
 
-def _camera_rows(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
-    """[V, 18]: fx, fy, cx, cy, width, height, rotation row-major, translation."""
-    return np.array(
-        [
-            [c.fx, c.fy, c.cx, c.cy, c.width, c.height, *c.rotation.ravel(), *c.translation]
-            for c in cameras
-        ],
-        np.float64,
-    )
-
-
 def fuse(
     depths: Sequence[Array],
     confidences: Sequence[Array],
@@ -209,18 +199,8 @@ def fuse(
     Returns:
         The cloud, in the order of views and pixels.
     """
-    count = len(cameras)
-    height = max(depth.shape[0] for depth in depths)
-    width = max(depth.shape[1] for depth in depths)
-    depth_stack = np.zeros((count, height, width), np.float32)
-    confidence_stack = np.ones((count, height, width), np.float32)
-    image_stack = np.zeros((count, height, width, 3), np.float32)
-    for v in range(count):
-        h, w = depths[v].shape
-        depth_stack[v, :h, :w] = depths[v]
-        confidence_stack[v, :h, :w] = confidences[v]
-        image_stack[v, :h, :w] = images[v]
-    table = _camera_rows(cameras)
+    depth_stack, confidence_stack, image_stack = map(stacked, (depths, confidences, images))
+    table = camera_table(cameras)
     parts: list[tuple[Array, ...]] = []
     residuals = []
     fill = 0
@@ -254,7 +234,7 @@ def fuse(
                     confidences[v][kept],
                 )
             )
-            progress(v + 1, count)
+            progress(v + 1, len(cameras))
     positions, colors, normals, trust = (np.concatenate(a) for a in zip(*parts, strict=True))
     agreed = np.concatenate(residuals)
     residual_median = float(np.median(agreed)) if len(agreed) else float("nan")

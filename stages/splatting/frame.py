@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.points import Points
+from pipeline.geometry.world import move_camera
 from stages.splatting.harmonics import harmonics
 
 Array = npt.NDArray[np.float64]
@@ -86,14 +87,8 @@ def _moved_light(light: Light | None, scale: float, rotation: Array) -> Light | 
 
 def move_cameras(cameras: Iterable[Camera], similarity: Array) -> tuple[Camera, ...]:
     """The cameras in the frame that `similarity` [4, 4] leads to; their pictures stay the same."""
-    scale, rotation, translation = split_similarity(similarity)
-    moved = []
-    for camera in cameras:
-        pose = np.eye(4)
-        pose[:3, :3] = camera.rotation @ rotation.T
-        pose[:3, 3] = scale * camera.translation - pose[:3, :3] @ translation
-        moved.append(replace(camera, cam_from_world=pose))
-    return tuple(moved)
+    motion = split_similarity(similarity)
+    return tuple(move_camera(camera, motion) for camera in cameras)
 
 
 def move_points(points: Points, similarity: Array) -> Points:

@@ -6,6 +6,8 @@ surface; it is refuted when they see through it (the test of COLMAP's and MVSNet
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -15,17 +17,17 @@ from pipeline.kernels import each, helper, kernel
 Array = npt.NDArray[np.float32]
 
 
-def stack_depths(depths: list[Array]) -> Array:
-    """Stack depth maps of different size into [V, H_max, W_max] float32, 0 outside."""
-    height = max(depth.shape[0] for depth in depths)
-    width = max(depth.shape[1] for depth in depths)
-    stack = np.zeros((len(depths), height, width), np.float32)
-    for v, depth in enumerate(depths):
-        stack[v, : depth.shape[0], : depth.shape[1]] = depth
+def stacked(images: Sequence[Array], outside: float | np.float32 = 0.0) -> Array:
+    """Images or maps of different size as one array [V, H_max, W_max(, C)] float32."""
+    height = max(image.shape[0] for image in images)
+    width = max(image.shape[1] for image in images)
+    stack = np.full((len(images), height, width, *images[0].shape[2:]), outside, np.float32)
+    for v, image in enumerate(images):
+        stack[v, : image.shape[0], : image.shape[1]] = image
     return stack
 
 
-def camera_table(cameras: list[Camera]) -> npt.NDArray[np.float64]:
+def camera_table(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
     """[V, 18] float64: fx, fy, cx, cy, width, height, rotation row-major, translation."""
     rows = [
         [c.fx, c.fy, c.cx, c.cy, c.width, c.height, *c.rotation.ravel(), *c.translation]
@@ -130,7 +132,7 @@ def check(
 
     Args:
         index: the view in question.
-        depths: [V, H_max, W_max] float32 from `stack_depths`; 0 where there is none.
+        depths: [V, H_max, W_max] float32 from `stacked`; 0 where there is none.
         weights: [V, H_max, W_max] float32 > 0, of each depth in the fused mean.
         cameras: [V, 18] float64 from `camera_table`.
         shape: (H, W) of the view.

@@ -14,7 +14,7 @@ from pipeline.geometry.order import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
-from stages.stereo.consistency import camera_table, check, stack_depths
+from stages.stereo.consistency import camera_table, check, stacked
 from stages.stereo.fill import complete, distance_to
 from stages.stereo.options import METHODS, DenseOptions, DenseView
 from stages.stereo.polish import polish, source_maps
@@ -256,8 +256,8 @@ def _consistent(
     needed = options.min_agreeing or 1 + (len(depths) >= 6) + (len(depths) >= 12)
     needed = min(needed, max(len(depths) - 1, 1))
     table = camera_table(cameras)
-    stack = stack_depths(depths)
-    weights = stack_depths([np.maximum(score, 0.05) ** 2 for score in scores])
+    stack = stacked(depths)
+    weights = stacked([np.maximum(score, 0.05) ** 2 for score in scores])
     kept, agreeing, angles = [], [], []
     for index, depth in enumerate(depths):
         agree, conflict, fused, angle = check(
@@ -337,7 +337,7 @@ def _finish(
 ) -> list[DenseView]:
     """Complete every view and add normals."""
     table = camera_table(cameras)
-    stack = stack_depths(depths)
+    stack = stacked(depths)
     result = []
     for index, (depth, confidence) in enumerate(zip(depths, confidences, strict=True)):
         known = depth > 0

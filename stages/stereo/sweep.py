@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.kernels import each, helper, kernel
+from stages.stereo.consistency import stacked
 from stages.stereo.tiles import TILE, Buffer, Volume, full_ranges, tile_grid
 
 Array = npt.NDArray[np.float32]
@@ -63,12 +64,8 @@ def stack_sources(images: list[Array], usable: list[npt.NDArray[np.bool_]]) -> t
         [S, H, W] float32 with `UNUSABLE` outside each image and where not usable, and
         [S, 2] float32 (height, width) of each.
     """
-    height = max(image.shape[0] for image in images)
-    width = max(image.shape[1] for image in images)
-    stack = np.full((len(images), height, width), UNUSABLE, np.float32)
-    for s, (image, use) in enumerate(zip(images, usable, strict=True)):
-        stack[s, : image.shape[0], : image.shape[1]] = np.where(use, image, UNUSABLE)
-    return stack, np.array([image.shape for image in images], np.float32)
+    marked = [np.where(use, image, UNUSABLE) for image, use in zip(images, usable, strict=True)]
+    return stacked(marked, UNUSABLE), np.array([image.shape for image in images], np.float32)
 
 
 @helper(fastmath=True)

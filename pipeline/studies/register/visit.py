@@ -16,7 +16,7 @@ from pipeline.artifacts.dental.sizes import millimetres_per_unit
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
-from pipeline.geometry.similarity import moved_camera
+from pipeline.geometry.world import move_camera
 from pipeline.studies.register.hardware import braces_in, painted_over
 
 Array = npt.NDArray[np.float64]
@@ -260,8 +260,7 @@ def scale_of(frame: Array) -> float:
 def in_frame(camera: Camera, frame: Array) -> Camera:
     """The camera in a frame that a similarity [4, 4] leads to; depths scale with it."""
     scale = scale_of(frame)
-    pose = moved_camera(camera.cam_from_world, scale, frame[:3, :3] / scale, frame[:3, 3])
-    return replace(camera, cam_from_world=pose)
+    return move_camera(camera, (scale, frame[:3, :3] / scale, frame[:3, 3]))
 
 
 def labels_of(dentition, view) -> Labels:  # type: ignore[no-untyped-def]

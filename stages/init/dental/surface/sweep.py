@@ -22,6 +22,7 @@ from stages.init.dental.surface.fit import fit_offsets
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.dental.surface.photos.photo import Photo
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
+from stages.stereo.consistency import stacked
 from stages.stereo.tiles import Volume
 
 Array32 = npt.NDArray[np.float32]
@@ -304,7 +305,7 @@ def matching_cost(
         _volume(
             np.ascontiguousarray(points[:, left:right]),
             np.ascontiguousarray(normals[:, left:right]), offsets,
-            _stack([photo.texture for photo in shown]),
+            stacked([photo.texture for photo in shown]),
             np.array([photo.size for photo in shown], np.int64),
             np.array([photo.camera for photo in shown], np.float32),
             np.array([[views.index(a), views.index(b)] for a, b in compared], np.int64),
@@ -332,16 +333,6 @@ def _stretches(
         if compared:
             stretches.append((first, last, compared))
     return stretches
-
-
-def _stack(images: list[Array32]) -> Array32:
-    """[V, H, W] float32 of images of different size, 0 outside."""
-    height = max(image.shape[0] for image in images)
-    width = max(image.shape[1] for image in images)
-    stack = np.zeros((len(images), height, width), np.float32)
-    for k, image in enumerate(images):
-        stack[k, : image.shape[0], : image.shape[1]] = image
-    return stack
 
 
 def _reference(photos: list[Photo], points: Array32, seen: npt.NDArray[np.bool_]) -> Array32:
