@@ -33,6 +33,7 @@ from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.solution import PlacedView
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.teeth.choose import ChoiceOptions, choose
 from stages.teeth.reader import read_photographs
 
@@ -213,8 +214,8 @@ def epipolar_errors(case: Case, teeth: Reconstruction) -> tuple[float, float]:
         shared = sorted(set(seen[i]) & set(seen[i + 1]))
         ends = [np.array([seen[k][name] for name in shared]).reshape(-1, 2) for k in (i, i + 1)]
         ours = [_camera(teeth, k) for k in (i, i + 1)]
-        found.append(_sampson(*ours, *ends))
-        truth.append(_sampson(*case.cameras[i : i + 2], *ends))
+        found.append(sampson_distance(fundamental_between(*ours), *ends))
+        truth.append(sampson_distance(fundamental_between(*case.cameras[i : i + 2]), *ends))
     return float(np.median(np.concatenate(found))), float(np.median(np.concatenate(truth)))
 
 
@@ -236,17 +237,6 @@ def _camera(teeth: Reconstruction, number: int) -> Camera:
     size = (view.width, view.height)
     centre = (size[0] / 2, size[1] / 2)
     return Camera("", *size, placed.focal, placed.focal, *centre, placed.cam_from_world)
-
-
-def _sampson(first: Camera, second: Camera, one: Array, other: Array) -> Array:
-    relative = second.cam_from_world @ np.linalg.inv(first.cam_from_world)
-    x, y, z = relative[:3, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
-    fundamental = np.linalg.inv(second.matrix).T @ essential @ np.linalg.inv(first.matrix)
-    one, other = (np.column_stack([p, np.ones(len(p))]) for p in (one, other))
-    lines, back = one @ fundamental.T, other @ fundamental
-    slope = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
-    return np.abs((lines * other).sum(1)) / slope
 
 
 def surface_scores(

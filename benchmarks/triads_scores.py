@@ -13,10 +13,12 @@ import numpy.typing as npt
 from triads_data import CASE, FRONTS, SERIES, SIDES, SWAPPED, Item, Photo, TruthPoint
 from triads_run import Outcome
 
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.overlay import DOUBT_SHOWN
 from stages.dentition.working import working_scale
+from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 
 if TYPE_CHECKING:
     from stages.init.dental.solution import PlacedView
@@ -227,8 +229,8 @@ def epipolar_error(outcome: Outcome) -> Row | None:
         shared = sorted(set(a) & set(b))
         if len(shared) < LEAST_LANDMARKS:
             continue
-        fundamental = _fundamental(one, first.size, two, second.size)
-        off = sampson(
+        fundamental = fundamental_between(_camera(one, first.size), _camera(two, second.size))
+        off = sampson_distance(
             fundamental, np.array([a[k] for k in shared]), np.array([b[k] for k in shared])
         )
         distances += off.tolist()
@@ -256,27 +258,9 @@ def landmarks(dentition: Dentition) -> dict[tuple[str, int, int], Array]:
     return found
 
 
-def _matrix(placed: PlacedView, size: tuple[int, int]) -> Array:
-    focal = placed.focal
-    return np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]], np.float64)
-
-
-def _fundamental(
-    one: PlacedView, first: tuple[int, int], two: PlacedView, second: tuple[int, int]
-) -> Array:
-    relative = two.cam_from_world @ np.linalg.inv(one.cam_from_world)
-    x, y, z = relative[:3, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
-    inverse = np.linalg.inv(_matrix(two, second)).T
-    return np.asarray(inverse @ essential @ np.linalg.inv(_matrix(one, first)))
-
-
-def sampson(fundamental: Array, one: Array, other: Array) -> Array:
-    """[N] Sampson distance of pixels [N, 2] in two photographs."""
-    one, other = (np.column_stack([p, np.ones(len(p))]) for p in (one, other))
-    lines, back = one @ fundamental.T, other @ fundamental
-    slope = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
-    return np.asarray(np.abs((lines * other).sum(1)) / np.maximum(slope, 1e-12))
+def _camera(placed: PlacedView, size: tuple[int, int]) -> Camera:
+    focal, centre = placed.focal, (size[0] / 2, size[1] / 2)
+    return Camera("", *size, focal, focal, *centre, placed.cam_from_world)
 
 
 def is_good(row: Row) -> bool:

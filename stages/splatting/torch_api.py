@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.geometry.rigid import skew
 from stages.splatting import reference
 from stages.splatting.rasterizer import LOW_PASS, Rendering, Viewpoint, rasterize
 
@@ -232,9 +233,8 @@ def pose_gradient(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
     """
     v, w = twist[:3], twist[3:]
     a = 0.5 * (w - np.cross(pose[:3, 3].astype(np.float64), v))
-    cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
     result = np.zeros((4, 4))
-    result[:3, :3] = cross @ pose[:3, :3]
+    result[:3, :3] = skew(a) @ pose[:3, :3]
     result[:3, 3] = v
     return result
 

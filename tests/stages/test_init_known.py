@@ -22,13 +22,9 @@ from pipeline.geometry.models.known_cameras import (
 )
 from pipeline.stage import LocalContext
 from stages.init.scale import mm_per_unit
+from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.init.sfm.matching.two_view import Correspondences
-from stages.init.sfm.triangulate import (
-    agreeing_matches,
-    epipolar_distance,
-    link_tracks,
-    triangulate,
-)
+from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
 from stages.init.stage import InitConfig, InitStage
 from stages.init.write import place_in
 
@@ -288,7 +284,9 @@ def test_tracks_are_triangulated_and_wrong_matches_dropped():
         matches[i, j] = Correspondences(
             features, pixels[i][features[:, 0]], pixels[j][features[:, 1]], np.ones(60, bool)
         )
-    distance = epipolar_distance(cameras[0], cameras[1], matches[0, 1])
+    fundamental = fundamental_between(cameras[0], cameras[1])
+    found = matches[0, 1]
+    distance = sampson_distance(fundamental, found.positions_i, found.positions_j)
     assert distance[10:].max() < 1e-6 and np.median(distance[:10]) > 3
     chosen = agreeing_matches(cameras, matches, 1.0)
     tracks = link_tracks(pixels, [np.arange(60)] * 3, matches, chosen)

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.graph import Pair
+from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.init.sfm.matching.two_view import Correspondences
 
 Array = npt.NDArray[np.float64]
@@ -35,20 +36,6 @@ class Tracks:
         return Tracks(self.point[chosen], self.view[chosen], self.pixel[chosen])
 
 
-def epipolar_distance(camera_i: Camera, camera_j: Camera, found: Correspondences) -> Array:
-    """[M] Sampson distance in pixels of matches to the epipolar geometry of two known cameras."""
-    j_from_i = camera_j.cam_from_world @ np.linalg.inv(camera_i.cam_from_world)
-    x, y, z = j_from_i[:3, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ j_from_i[:3, :3]
-    fundamental = np.linalg.inv(camera_j.matrix).T @ essential @ np.linalg.inv(camera_i.matrix)
-    ones = np.ones((len(found.positions_i), 1))
-    lines_j = np.hstack([found.positions_i, ones]) @ fundamental.T
-    lines_i = np.hstack([found.positions_j, ones]) @ fundamental
-    residual = np.abs((lines_j * np.hstack([found.positions_j, ones])).sum(1))
-    gradient = np.sqrt((lines_j[:, :2] ** 2).sum(1) + (lines_i[:, :2] ** 2).sum(1))
-    return np.asarray(residual / np.maximum(gradient, 1e-12))
-
-
 def agreeing_matches(
     cameras: list[Camera], correspondences: dict[Pair, Correspondences], max_error: float
 ) -> dict[Pair, Integers]:
@@ -57,12 +44,12 @@ def agreeing_matches(
     Only matches that move along with their neighbours count: on repetitive teeth a wrong match
     often lies on the line by chance.
     """
-    return {
-        (i, j): np.flatnonzero(
-            (epipolar_distance(cameras[i], cameras[j], found) < max_error) & found.coherent
-        )
-        for (i, j), found in sorted(correspondences.items())
-    }
+    agreeing = {}
+    for (i, j), found in sorted(correspondences.items()):
+        fundamental = fundamental_between(cameras[i], cameras[j])
+        distance = sampson_distance(fundamental, found.positions_i, found.positions_j)
+        agreeing[i, j] = np.flatnonzero((distance < max_error) & found.coherent)
+    return agreeing
 
 
 def link_tracks(

@@ -15,9 +15,11 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from pipeline.artifacts.dental.fdi import is_upper
+from pipeline.geometry.rigid import skew
 from pipeline.kernels.threads import in_threads, opencv_threads
 from stages.init.dental.cameras.bundle import Adjusted, Matches, view_angles
 from stages.init.dental.template import GUM_STEPS, landmark_names
+from stages.init.sfm.matching.epipolar import sampson_distance
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -278,16 +280,10 @@ def sampson_distances(adjusted: Adjusted, i: int, j: int, pixels: Array) -> Arra
     """[M] distance in pixels of matches [M, 4] of views i and j from their epipolar lines."""
     rotation = adjusted.rotations[j] @ adjusted.rotations[i].T
     t = adjusted.translations[j] - rotation @ adjusted.translations[i]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     to_i = np.diag([1 / adjusted.focals[i], 1 / adjusted.focals[i], 1.0])
     to_j = np.diag([1 / adjusted.focals[j], 1 / adjusted.focals[j], 1.0])
-    fundamental = to_j @ cross @ rotation @ to_i
-    ones = np.ones((len(pixels), 1))
-    a, b = np.hstack([pixels[:, :2], ones]), np.hstack([pixels[:, 2:], ones])
-    line_b, line_a = a @ fundamental.T, b @ fundamental
-    error = (b * line_b).sum(1)
-    length = np.sqrt((line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1))
-    return np.asarray(np.abs(error) / (length + 1e-30))
+    fundamental = to_j @ skew(t) @ rotation @ to_i
+    return sampson_distance(fundamental, pixels[:, :2], pixels[:, 2:])
 
 
 def dense_matches(

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from pipeline.geometry.graph import Pair, spanning_pairs
 from pipeline.geometry.models.colmap import quiet_pycolmap
 from pipeline.geometry.rigid import angle_between
+from stages.init.sfm.matching.epipolar import fundamental_of, sampson_distance
 
 Array = npt.NDArray[np.float64]
 
@@ -156,13 +157,12 @@ def verify_pair(
     )
     if found is None:
         return None
-    errors = sampson_errors(
+    fundamental = fundamental_of(
         np.asarray(found["E"]),
         np.asarray(camera_i.calibration_matrix()),
         np.asarray(camera_j.calibration_matrix()),
-        correspondences.positions_i,
-        correspondences.positions_j,
     )
+    errors = sampson_distance(fundamental, correspondences.positions_i, correspondences.positions_j)
     inliers = np.flatnonzero(errors <= max_error)
     # Asked again among the inliers: what gave a false match its support may be gone.
     coherent = coherent_matches(
@@ -199,19 +199,6 @@ def homography_share(
         correspondences.positions_i[sampled], correspondences.positions_j[sampled], options
     )
     return 0.0 if found is None else float(np.mean(np.asarray(found["inlier_mask"], bool)))
-
-
-def sampson_errors(
-    essential: Array, matrix_i: Array, matrix_j: Array, positions_i: Array, positions_j: Array
-) -> Array:
-    """[M] first-order distance in pixels of matches [M, 2] from an epipolar geometry."""
-    fundamental = np.linalg.inv(matrix_j).T @ essential @ np.linalg.inv(matrix_i)
-    ones = np.ones((len(positions_i), 1))
-    first, second = np.hstack([positions_i, ones]), np.hstack([positions_j, ones])
-    line_j, line_i = first @ fundamental.T, second @ fundamental
-    steepness = (line_j[:, :2] ** 2).sum(1) + (line_i[:, :2] ** 2).sum(1)
-    algebraic = np.abs((second * line_j).sum(1))
-    return np.asarray(algebraic / np.sqrt(np.maximum(steepness, 1e-24)))
 
 
 def coherent_matches(
