@@ -43,3 +43,19 @@ def opacity_bytes(gaussians: Gaussians) -> npt.NDArray[np.uint8]:
 def opacities(gaussians: Gaussians) -> npt.NDArray[np.float64]:
     """[N] float64 in 0..1."""
     return 1.0 / (1.0 + np.exp(-gaussians.logit_opacities.astype(np.float64)))
+
+
+def smallest_three(
+    quats_wxyz: npt.NDArray[np.floating],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Quaternions [N, 4] as which component is the largest [N], and the others [N, 3] in order.
+
+    The largest is positive and follows from the others, which are within +-sqrt 0.5.
+    """
+    quats = np.asarray(quats_wxyz, np.float64)
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(1)
+    rows = np.arange(len(quats))
+    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]  # [N, 3]
+    return largest, quats[rows[:, None], others]

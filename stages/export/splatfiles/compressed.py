@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians, ply_comment
-from stages.export.splats import coefficients, opacity_bytes
+from stages.export.splats import coefficients, opacity_bytes, smallest_three
 from stages.splatting.rendering import CONSTANT_HARMONIC
 
 CHUNK = 256
@@ -98,11 +98,6 @@ def _packed(shares: npt.NDArray[np.floating], bits: tuple[int, ...]) -> npt.NDAr
 
 def _rotations(quats_wxyz: npt.NDArray[np.floating]) -> npt.NDArray[np.uint32]:
     """[N, 4] quaternions -> which component is the largest (2 bits), the others (10 bits each)."""
-    quats = np.asarray(quats_wxyz, np.float64)
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    shares = quats[rows[:, None], others] * np.sqrt(0.5) + 0.5
+    largest, others = smallest_three(quats_wxyz)
+    shares = others * np.sqrt(0.5) + 0.5
     return largest.astype(np.uint32) << np.uint32(30) | _packed(shares, (10, 10, 10))

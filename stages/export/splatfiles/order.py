@@ -23,7 +23,12 @@ def morton_order(points: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
     low, high = np.percentile(points, [1, 99], axis=0)
     share = (points - low) / np.maximum(high - low, 1e-30)
     cells = np.clip(share * (1 << BITS), 0, (1 << BITS) - 1).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
+    return order_of_cells(cells)
+
+
+def order_of_cells(cells: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+    """[N] indices of cells [N, 3] of a grid of `BITS` bits an axis along a Morton curve."""
+    code = np.zeros(len(cells), np.uint64)
     for bit in range(BITS):
         for axis in range(3):
             one = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)

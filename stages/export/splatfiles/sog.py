@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splats import coefficients, opacity_bytes
+from stages.export.splats import coefficients, opacity_bytes, smallest_three
 
 Floats = npt.NDArray[np.floating]
 Bytes = npt.NDArray[np.uint8]
@@ -134,13 +134,8 @@ def _coded(values: Floats) -> tuple[Bytes, list[float]]:
 
 def _rotations(quats_wxyz: Floats) -> Bytes:
     """[N, 4] quaternions as bytes: the three smallest components, 252 + place of the largest."""
-    quats = np.asarray(quats_wxyz, np.float64)
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    shares = quats[rows[:, None], others] * np.sqrt(0.5) + 0.5
+    largest, others = smallest_three(quats_wxyz)
+    shares = others * np.sqrt(0.5) + 0.5
     found = np.concatenate([np.rint(shares * 255), 252 + largest[:, None]], 1)
     return np.clip(found, 0, 255).astype(np.uint8)
 

@@ -31,7 +31,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splats import coefficients, opacities
+from stages.export.splatfiles.order import order_of_cells
+from stages.export.splats import coefficients, opacities, smallest_three
 
 Floats = npt.NDArray[np.floating]
 Integers = npt.NDArray[np.integer]
@@ -87,24 +88,14 @@ def morton_order(points: Floats) -> npt.NDArray[np.int64]:
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     cells = (points - low) / np.maximum(high - low, 1e-12).max() * 1023
     cells = np.clip(cells, 0, 1023).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            one = cells[:, axis] >> np.uint64(bit) & np.uint64(1)
-            code |= one << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return order_of_cells(cells)
 
 
 def packed_quaternions(quats_wxyz: Floats) -> npt.NDArray[np.uint32]:
     """[N, 4] quaternions -> [N] uint32: bits 30-31 which component is the largest (made positive
     and left out), 0-9, 10-19, 20-29 the others in order, from -1/sqrt 2 to 1/sqrt 2."""
-    quats = np.asarray(quats_wxyz, np.float64)
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]  # [N, 3]
-    share = (quats[rows[:, None], others] * np.sqrt(2) + 1) / 2
+    largest, others = smallest_three(quats_wxyz)
+    share = (others * np.sqrt(2) + 1) / 2
     levels = np.clip(np.rint(share * 1023), 0, 1023).astype(np.uint32)
     packed = levels[:, 0] | levels[:, 1] << np.uint32(10) | levels[:, 2] << np.uint32(20)
     return packed | largest.astype(np.uint32) << np.uint32(30)
