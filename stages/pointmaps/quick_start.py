@@ -16,7 +16,7 @@ from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
 from pipeline.geometry.depths import view_depths
 from pipeline.geometry.normals import depth_normals
-from pipeline.geometry.start import start_from_cameras, start_from_tree
+from pipeline.geometry.start import start_from_tree
 from pipeline.geometry.world import move_camera, normalising_similarity
 
 
@@ -41,17 +41,15 @@ def quick_start(
     pairs: Sequence[PointmapPair],
     views: Sequence[View],
     focals: Mapping[str, float] | None = None,
-    cameras: Sequence[Camera] | None = None,
     max_points: int = 400_000,
     seed: int = 0,
 ) -> QuickStart:
-    """Chain the pairs along their best spanning tree, or hang them on known cameras.
+    """Chain the pairs along their best spanning tree, in a normalised world.
 
     Args:
         pairs: pointmaps at the pixels of the views.
         views: the photographs.
         focals: known focal lengths, pixels, by name of the view.
-        cameras: known cameras; their world is kept. Else the world is normalised.
         max_points: points drawn at most.
         seed: of that draw.
 
@@ -59,11 +57,7 @@ def quick_start(
         ReconstructionError: the pointmaps connect no two views.
     """
     pairs = list(pairs)
-    start = (
-        start_from_cameras(pairs, {camera.name: camera for camera in cameras})
-        if cameras
-        else start_from_tree(pairs, focals)
-    )
+    start = start_from_tree(pairs, focals)
     depths = view_depths(pairs, start)
     placed = [view for view in views if view.name in depths]
     if len(placed) < 2:
@@ -72,18 +66,15 @@ def quick_start(
             "of them see. Take photographs that overlap more, 10 to 20 degrees apart, in focus."
         )
     found = [start.cameras[view.name] for view in placed]
-    if not cameras:
-        surface = np.concatenate(
-            [
-                camera.unproject(depths[camera.name].depth)[depths[camera.name].depth > 0]
-                for camera in found
-            ]
-        )
-        motion = normalising_similarity(found, surface)
-        found = [move_camera(camera, motion) for camera in found]
-        scale = np.float32(motion[0])
-    else:
-        scale = np.float32(1)
+    surface = np.concatenate(
+        [
+            camera.unproject(depths[camera.name].depth)[depths[camera.name].depth > 0]
+            for camera in found
+        ]
+    )
+    motion = normalising_similarity(found, surface)
+    found = [move_camera(camera, motion) for camera in found]
+    scale = np.float32(motion[0])
     clouds, maps = [], []
     for view, camera in zip(placed, found, strict=True):
         confidence = np.where(view.valid(), depths[view.name].confidence, np.float32(1))

@@ -113,16 +113,6 @@ def test_spoiled_answers_of_mixed_sizes_still_place_the_cameras(method, monkeypa
     assert known.cameras[0].fx == 200.0
 
 
-def test_known_cameras_are_kept_by_the_quick_start(monkeypatch, tmp_path):
-    cameras, views, _ = photographs()
-    stand_in.fake_dust3r(monkeypatch, stand_in.Truth(cameras))
-    options = PointmapOptions("dust3r", weights(tmp_path), device="cpu", long_side=128)
-    start = quick_start(predict_pointmaps(views, True, options), views, cameras=cameras)
-    assert start.cameras == tuple(cameras)
-    distance = np.linalg.norm(start.points.positions - stand_in.scene.BALL, axis=1)
-    assert distance.min() > 0.97 * stand_in.scene.RADIUS
-
-
 def test_the_graph_and_the_mask_are_respected(monkeypatch, tmp_path):
     cameras, views, _ = photographs()
     mask = np.zeros((96, 128), bool)

@@ -87,8 +87,7 @@ class PlacedTeeth:
 def reconstruct_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
-    accept_doubtful: bool, threads: int, progress: Progress, cameras: list[Array] | None = None,
-    scales: list[float] | None = None,
+    accept_doubtful: bool, threads: int, progress: Progress,
 ) -> Reconstruction:  # fmt: skip
     """Say which tooth is which, place the cameras, and make the surface.
 
@@ -101,8 +100,6 @@ def reconstruct_teeth(
         dentitions: the crowns of each; None: it takes no part.
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
-        cameras: [4, 4] cam_from_world of each where the cameras are known (`fit_arch`).
-        scales: by how much each is reduced; None: `working_scale`.
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
@@ -110,7 +107,7 @@ def reconstruct_teeth(
     """
     teeth = place_teeth(
         views, names, dentitions, focals, arch, accept_doubtful=accept_doubtful, threads=threads,
-        progress=progress, cameras=cameras, scales=scales,
+        progress=progress,
     )  # fmt: skip
     return with_surface(teeth, surface, threads, progress)
 
@@ -118,9 +115,13 @@ def reconstruct_teeth(
 def place_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, *, accept_doubtful: bool, threads: int,
-    progress: Progress, cameras: list[Array] | None, scales: list[float] | None,
+    progress: Progress, cameras: list[Array] | None = None, scales: list[float] | None = None,
 ) -> PlacedTeeth:  # fmt: skip
     """Say which tooth is which, and place the cameras; arguments as for `reconstruct_teeth`.
+
+    Args:
+        cameras: [4, 4] cam_from_world of each where the cameras are known (`fit_arch`).
+        scales: by how much each is reduced; None: `working_scale`.
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful.
