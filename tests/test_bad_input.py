@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline import cli
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
 PHOTOS = sorted(SAMPLES.glob("*.jpg"))
@@ -134,30 +132,6 @@ def test_photographs_that_share_nothing(workspace: Path, tmp_path: Path) -> None
     status, paragraph = call(workspace, str(tmp_path))
     assert status == 3, paragraph
     assert ".png" in paragraph and "photograph" in paragraph
-
-
-def test_unreadable_folder(
-    workspace: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """In this process, since root may read every folder."""
-    closed = one_image(tmp_path)
-    scan = os.scandir
-
-    def refuse(folder: str | Path = ".") -> object:
-        if Path(folder) == closed:
-            raise PermissionError(13, "Permission denied", str(folder))
-        return scan(folder)
-
-    monkeypatch.setattr("os.scandir", refuse)
-    monkeypatch.setattr(sys, "argv", ["pipeline", "run", str(closed), "-w", str(workspace)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert str(closed) in message and "permission denied" in message
 
 
 def test_full_disk(tmp_path: Path) -> None:

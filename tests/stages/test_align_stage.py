@@ -19,7 +19,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.depths import view_depths
 from pipeline.geometry.start import start_from_cameras, start_from_tree
-from pipeline.stage import LocalContext, get_stage
+from pipeline.stage import LocalContext
 from stages.align.fusion import FusionOptions, fuse
 from stages.align.stage import AlignConfig, AlignStage, _fill_confidence
 from tests.stages import dense_scene as _scene
@@ -356,7 +356,3 @@ def test_pointmaps_of_another_size_are_refused(world, tmp_path):
     small = replace(first, points_i=first.points_i[:-1], confidence_i=first.confidence_i[:-1])
     with pytest.raises(RequestError, match="128x95"):
         run(tmp_path, AlignConfig(), views=views_of(world), pointmaps=Pointmaps([small]))
-
-
-def test_the_stage_is_registered():
-    assert isinstance(get_stage("align"), AlignStage)

@@ -15,7 +15,7 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.views import View, Views, read_png, to_uint8
 from pipeline.errors import RequestError
-from pipeline.stage import LocalContext, get_stage
+from pipeline.stage import LocalContext
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.evaluation import evaluate
 from stages.evaluate.images.metrics import psnr, ssim
@@ -71,10 +71,6 @@ def context(folder: Path, views: Views, names: list[str], **config: Any) -> Loca
     cameras = Cameras(tuple(camera(name, *sizes.get(name, (20, 30))) for name in names))
     inputs = {"views": views, "cameras": cameras, "gaussians": GAUSSIANS}
     return LocalContext(EvaluateConfig(**config), folder, inputs, threads=1)
-
-
-def test_registered() -> None:
-    assert isinstance(get_stage("evaluate"), EvaluateStage)
 
 
 def test_figures_of_views_of_different_sizes(tmp_path: Path) -> None:

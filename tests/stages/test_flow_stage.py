@@ -14,7 +14,7 @@ from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
-from pipeline.stage import LocalContext, get_stage
+from pipeline.stage import LocalContext
 from stages.flow.geometry import occluded, predicted_flow
 from stages.flow.stage import FlowConfig, FlowStage
 from tests.stages import flow_scene as scene
@@ -60,10 +60,6 @@ def both_ways(shots: list[Shot], pair: FlowPair) -> list[tuple[np.ndarray, np.nd
         (errors(i, j, pair.forward), pair.mask_forward),
         (errors(j, i, pair.backward), pair.mask_backward),
     ]
-
-
-def test_registered() -> None:
-    assert isinstance(get_stage("flow"), FlowStage)
 
 
 @pytest.mark.parametrize("method", ["dis", "farneback"])

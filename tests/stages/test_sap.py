@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from pipeline.artifacts.points import Points
 from pipeline.errors import ReconstructionError
-from pipeline.stage import LocalContext, get_stage
+from pipeline.stage import LocalContext
 from stages.sap.budget import reduce_cloud
 from stages.sap.downsample import Cloud, voxel_downsample, voxel_size_for
 from stages.sap.prune import oversized, survivors
@@ -171,7 +171,3 @@ def test_nothing_left_is_a_diagnosis(tmp_path):
     broken.positions[:] = np.nan
     with pytest.raises(ReconstructionError, match="overlap"):
         run(tmp_path, broken)
-
-
-def test_the_stage_is_registered():
-    assert isinstance(get_stage("sap"), SapStage)
