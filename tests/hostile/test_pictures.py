@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import socket
 import struct
@@ -26,6 +25,7 @@ from stages.views.find import find_images, find_masks
 from stages.views.reading import decode
 from stages.views.reading.decode import decode_mask, decode_photo
 from stages.views.stage import ViewsConfig, ViewsStage
+from tests.stages.views_pictures import encode
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "data_samples" / "three_photos"
@@ -37,12 +37,6 @@ pillow_heif.register_heif_opener()
 def noise(width: int = 160, height: int = 120, channels: int = 3) -> Image.Image:
     pixels = np.random.default_rng(0).integers(0, 255, (height, width, channels), np.uint8)
     return Image.fromarray(pixels)
-
-
-def encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
-    data = io.BytesIO()
-    image.save(data, kind, **options)
-    return data.getvalue()
 
 
 def chunk(name: bytes, body: bytes) -> bytes:
@@ -72,14 +66,14 @@ def webp(width: int, height: int) -> bytes:
 
 
 def jpeg(width: int, height: int) -> bytes:
-    data = bytearray(encoded(noise(), "JPEG"))
+    data = bytearray(encode(noise(), "JPEG"))
     place = data.index(b"\xff\xc0") + 5
     data[place : place + 4] = struct.pack(">HH", height, width)
     return bytes(data)
 
 
 def bmp(width: int, height: int) -> bytes:
-    data = bytearray(encoded(noise(), "BMP"))
+    data = bytearray(encode(noise(), "BMP"))
     data[18:26] = struct.pack("<ii", width, height)
     return bytes(data)
 
@@ -175,7 +169,7 @@ def test_memory_is_what_the_header_s_kind_says(
     kind: str, channels: int, options: dict[str, Any]
 ) -> None:
     image = noise(1000, 1000, channels).resize((5000, 4000), Image.Resampling.NEAREST)
-    data = encoded(image, kind, **options)
+    data = encode(image, kind, **options)
     strips = 40e6  # of constant size, beside the picture
     assert peak_share(data, 20_000_000) < min(look(data).memory, 14) + strips / 20e6
 
@@ -192,12 +186,12 @@ def test_only_named_formats_are_decoded(tmp_path: Path, monkeypatch: pytest.Monk
             read(post)
     assert not marker.exists()
     others = {
-        "GIF": (encoded(noise().convert("P"), "GIF"), "a GIF"),
-        "PPM": (encoded(noise(), "PPM"), "not a readable"),
-        "ICO": (encoded(noise(64, 64), "ICO"), "not a readable"),
-        "TGA": (encoded(noise(), "TGA"), "not a readable"),
+        "GIF": (encode(noise().convert("P"), "GIF"), "a GIF"),
+        "PPM": (encode(noise(), "PPM"), "not a readable"),
+        "ICO": (encode(noise(64, 64), "ICO"), "not a readable"),
+        "TGA": (encode(noise(), "TGA"), "not a readable"),
         "PDF": (b"%PDF-1.4\n", "a PDF"),
-        "J2K": (encoded(noise(), "JPEG2000"), "JPEG 2000"),
+        "J2K": (encode(noise(), "JPEG2000"), "JPEG 2000"),
         "SVG": (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "text file"),
         "DICOM": (bytes(128) + b"DICM", "a DICOM"),
         "film": (bytes(4) + b"ftypisom", "a film"),
@@ -209,7 +203,7 @@ def test_only_named_formats_are_decoded(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_pictures_of_phones_with_a_second_picture_inside() -> None:
-    both = encoded(noise(), "MPO", save_all=True, append_images=[noise(80, 60)])
+    both = encode(noise(), "MPO", save_all=True, append_images=[noise(80, 60)])
     assert decode_photo(both).rgb.shape == (120, 160, 3)
 
 
@@ -224,7 +218,7 @@ def test_texts_and_profiles_that_swell() -> None:
         decode_photo(png(100, 100, 8, 0, profile))
     info = PngImagePlugin.PngInfo()
     info.add_text("Comment", "ordinary", zip=True)
-    assert decode_photo(encoded(noise(), "PNG", pnginfo=info)).rgb.shape == (120, 160, 3)
+    assert decode_photo(encode(noise(), "PNG", pnginfo=info)).rgb.shape == (120, 160, 3)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +253,7 @@ def refused(folder: Path, **settings: Any) -> str:
 
 @pytest.mark.parametrize("name", ["post.jpg", "deep.png", "square.tif", "broken.heic"])
 def test_the_message_names_the_file(tmp_path: Path, name: str) -> None:
-    heic = encoded(noise(), "HEIF", quality=50)
+    heic = encode(noise(), "HEIF", quality=50)
     data = {
         **BOMBS, "post.jpg": b"%!PS-Adobe-3.0 EPSF-3.0\n", "broken.heic": heic[: len(heic) // 2],
     }[name]  # fmt: skip
@@ -282,8 +276,8 @@ def test_heic_and_tiff_are_decoded_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a case with both, the run itself opens neither."""
-    folder = two_and(tmp_path / "p", "a.heic", encoded(noise(), "HEIF", quality=90))
-    (folder / "b.tif").write_bytes(encoded(noise(170, 120), "TIFF", compression="tiff_lzw"))
+    folder = two_and(tmp_path / "p", "a.heic", encode(noise(), "HEIF", quality=90))
+    (folder / "b.tif").write_bytes(encode(noise(170, 120), "TIFF", compression="tiff_lzw"))
     kinds = []
     opened = decode.opened
 

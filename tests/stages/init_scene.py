@@ -1,5 +1,6 @@
 """Points on a bumpy surface photographed from an orbit: projections, noise, false matches."""
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -64,3 +65,10 @@ def worst_rotation(solution, poses):
         )
         for k in others
     )
+
+
+def texture(seed=0, size=(160, 200)):
+    """Smooth random grey levels [H, W] uint8 of several scales."""
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.normal(0, 1, size), (0, 0), s) * s for s in (1, 2, 4))
+    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)

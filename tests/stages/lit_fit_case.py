@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 
@@ -15,8 +16,10 @@ from stages.fit.stage import FitConfig
 from stages.splatting import render
 from stages.splatting.light import LitScene
 from stages.splatting.rasterizer import Viewpoint, rasterize
+from tests.stages import fit_case
 
 WIDTH, HEIGHT = 96, 72
+looking = partial(fit_case.looking, width=WIDTH, height=HEIGHT)
 TRUTH = {"diffuse_share": 0.8, "falloff": 2.0, "widths": (60.0, 12.0), "strengths": (0.4, 0.05)}
 
 
@@ -33,15 +36,6 @@ def bump(count: int, seed: int) -> Points:
     colors = 0.45 + 0.2 * np.stack([np.sin(x / 15), np.cos(y / 14), np.sin((x + y) / 17)], 1)
     columns = (np.stack([x, y, z], 1), colors, normals, np.full(count, 5.0), np.zeros(count))
     return Points(*(column.astype(np.float32) for column in columns))
-
-
-def looking(angle: float, name: str) -> Camera:
-    """A camera that circles about (0, 0, 100)."""
-    c, s = np.cos(angle), np.sin(angle)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    matrix[:3, 3] = np.array([0, 0, 100]) - matrix[:3, :3] @ [0, 0, 100]
-    return Camera(name, WIDTH, HEIGHT, 1.2 * WIDTH, 1.2 * WIDTH, WIDTH / 2, HEIGHT / 2, matrix)
 
 
 def lit_image(gaussians: Gaussians, camera: Camera) -> np.ndarray:

@@ -22,6 +22,7 @@ from stages.init.sfm.matching.match import (
     select_pairs,
 )
 from stages.init.sfm.reconstruct import weakly_linked
+from tests.stages.init_scene import texture
 
 
 def make_features(positions, descriptors):
@@ -55,14 +56,6 @@ def pair_of_views(count=300, strangers=100, noise=4, seed=0):
         np.concatenate([shaken, random_descriptors(strangers, seed + 2)]),
     )
     return first, second, {(int(i), k) for k, i in enumerate(order)}
-
-
-def texture(seed=0, size=(160, 200)):
-    rng = np.random.default_rng(seed)
-    image = sum(
-        cv2.GaussianBlur(rng.normal(0, 1, size), (0, 0), sigma) * sigma for sigma in (1, 2, 4)
-    )
-    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)
 
 
 def test_matches_are_the_true_ones():

@@ -1,6 +1,5 @@
 """Rolled photographs: the angle, and features of the photograph turned back."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -8,12 +7,9 @@ from stages.init.sfm.matching.features import detect_features, turned_back
 from stages.init.sfm.matching.match import match_features
 from stages.init.sfm.matching.roll import find_rolls, groups, relative_roll
 from stages.init.sfm.matching.two_view import unrolled
+from tests.stages.init_scene import texture
 
-
-def texture(seed=0, size=(200, 260)):
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(0, 1, size), (0, 0), s) * s for s in (1, 2, 4))
-    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)
+SIZE = (200, 260)
 
 
 def clockwise(gray, degrees):
@@ -45,7 +41,7 @@ def test_unrolled_positions_move_as_the_picture_does():
 
 @pytest.mark.parametrize("degrees", [40.0, 90.0])
 def test_a_rolled_photograph_is_noticed_and_matched(degrees):
-    gray = texture()
+    gray = texture(size=SIZE)
     rolled, gray_from_rolled = clockwise(gray, degrees)
     rolls = find_rolls(
         [gray, rolled], [everywhere(gray), everywhere(rolled)], [], 0.002, 1.0, 1, silent
@@ -67,13 +63,13 @@ def test_a_rolled_photograph_is_noticed_and_matched(degrees):
 
 
 def test_linked_photographs_are_left_alone():
-    grays = [texture(), clockwise(texture(), 90)[0]]
+    grays = [texture(size=SIZE), clockwise(texture(size=SIZE), 90)[0]]
     valid = [everywhere(gray) for gray in grays]
     assert find_rolls(grays, valid, [(0, 1)], 0.002, 1.0, 1, silent) == [0.0, 0.0]
 
 
 def test_strangers_have_no_roll_and_threads_change_nothing():
-    grays = [texture(0), texture(1), clockwise(texture(0), 60)[0]]
+    grays = [texture(0, SIZE), texture(1, SIZE), clockwise(texture(0, SIZE), 60)[0]]
     valid = [everywhere(gray) for gray in grays]
     one, two = (find_rolls(grays, valid, [], 0.002, 1.0, n, silent) for n in (1, 2))
     assert one == two

@@ -16,6 +16,7 @@ from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from stages.views.sheets import photographs_in
 from stages.views.stage import ViewsConfig, ViewsStage
+from tests.stages.views_pictures import write
 
 Bytes = npt.NDArray[np.uint8]
 WHITE, BLACK, BLUE = (255, 255, 255), (0, 0, 0), (20, 60, 128)
@@ -125,12 +126,6 @@ def test_things_before_a_plain_wall_are_one_photograph() -> None:
         pixels[ball] = np.resize(photograph(centre, 500, 300), (300, 500, 3))[ball]
     assert photographs_in(pixels, touching=True) == [(0, 0, 300, 500)]
     assert photographs_in(np.full((90, 120, 3), 7, np.uint8)) == [(0, 0, 90, 120)]
-
-
-def write(path: Path, pixels: Bytes, **options: object) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, **options)
-    return path
 
 
 def run_stage(folder: Path, images: Path, **settings: object) -> LocalContext:

@@ -19,6 +19,7 @@ from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from stages.views.stage import ViewsConfig, ViewsStage
+from tests.stages.views_pictures import write
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
@@ -29,12 +30,6 @@ def picture(seed: int, width: int = 120, height: int = 90) -> Bytes:
     random = np.random.default_rng(seed)
     small = random.integers(0, 255, (9, 12, 3), np.uint8)
     return np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC))
-
-
-def write(path: Path, pixels: Bytes, **options: Any) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, **options)
-    return path
 
 
 def run_stage(

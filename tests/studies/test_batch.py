@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ from pipeline.errors import RequestError
 from pipeline.stage import get_stage
 from pipeline.studies.batch.summary import COLUMNS
 from tests.studies import toy_batch
+from tests.studies.small_batch import wait_for
 
 pytest.importorskip("distributed")
 
@@ -329,14 +329,6 @@ def command(folder: Path, *arguments: str) -> subprocess.Popen[str]:
         )  # fmt: skip
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def wait_for(condition: Callable[[], Any]) -> None:
-    for _ in range(3000):
-        if condition():
-            return
-        time.sleep(0.02)
-    raise AssertionError("this never came to pass")
 
 
 def fitting(folder: Path) -> list[int]:

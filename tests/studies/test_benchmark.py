@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from pipeline.artifacts import KINDS
 from pipeline.errors import RequestError
 from pipeline.stage import get_stage
 from tests.studies import toy_bench
+from tests.studies.small_batch import wait_for
 
 SUITE: dict[str, Any] = {
     "title": "Toys",
@@ -373,14 +373,6 @@ def test_interrupt_ends_it_and_its_cells(tmp_path: Path) -> None:
     assert process.returncode == 130, told
     assert "Run the same command again" in told
     assert not workers(tmp_path)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    for _ in range(1500):
-        if condition():
-            return
-        time.sleep(0.02)
-    raise AssertionError("this never came to pass")
 
 
 def workers(folder: Path) -> list[str]:
