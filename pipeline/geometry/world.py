@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -77,3 +77,13 @@ def similarity_between(
 def move_camera(camera: Camera, motion: tuple[float, Array, Array]) -> Camera:
     """The camera in the world that (scale, rotation, translation) leads to, depths times scale."""
     return replace(camera, cam_from_world=moved_camera(camera.cam_from_world, *motion))
+
+
+def scene_depth(points: npt.NDArray[np.floating], cameras: Iterable[Camera]) -> float | None:
+    """Median over the cameras of the median depth of points [N, 3] ahead; None: nothing is."""
+    depths = []
+    for camera in cameras:
+        z = np.asarray(points, np.float64) @ camera.rotation[2] + camera.translation[2]
+        if (z > 0).any():
+            depths.append(float(np.median(z[z > 0])))
+    return float(np.median(depths)) if depths else None

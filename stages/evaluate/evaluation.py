@@ -15,6 +15,7 @@ from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.views import HeldOut, View, Views
 from pipeline.errors import RequestError
 from pipeline.geometry.pose_metrics import pose_figures
+from pipeline.geometry.world import scene_depth
 from pipeline.kernels.threads import in_threads
 from pipeline.stage import StageContext
 from stages.evaluate.config import EvaluateConfig
@@ -23,7 +24,6 @@ from stages.evaluate.held_out import (
     Registration,
     common_lens,
     register,
-    scene_depth,
     without_lens,
 )
 from stages.evaluate.images import pictures
@@ -92,7 +92,7 @@ def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Re
     )  # fmt: skip
     figures, surfaces = _input_views(context, examiner, views, cameras)
     figures["background"] = list(background)
-    depth = scene_depth(gaussians.means, list(cameras.values()))
+    depth = scene_depth(gaussians.means, cameras.values()) or 1.0
     if truth is not None:
         placed = {name: cameras[name] for name in cameras if name in truth.cameras}
         try:

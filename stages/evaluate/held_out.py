@@ -103,16 +103,6 @@ def register(
     )
 
 
-def scene_depth(means: npt.NDArray[np.floating], cameras: Sequence[Camera]) -> float:
-    """Median depth of points [N, 3] in front of the cameras; 1 where nothing is."""
-    depths = []
-    for camera in cameras:
-        z = np.asarray(means, np.float64) @ camera.rotation[2] + camera.translation[2]
-        if (z > 0).any():
-            depths.append(float(np.median(z[z > 0])))
-    return float(np.median(depths)) if depths else 1.0
-
-
 def common_lens(views: Sequence[View]) -> str | None:
     """The lens that was taken out of all views alike: "" for none, None where they differ.
 

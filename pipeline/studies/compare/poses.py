@@ -12,6 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.pose_metrics import pose_figures
 from pipeline.geometry.rigid import rotation_angle
 from pipeline.geometry.similarity import camera_similarity, moved_camera
+from pipeline.geometry.world import scene_depth
 
 Array = npt.NDArray[np.float64]
 Motion = tuple[float, Array, Array]
@@ -22,14 +23,9 @@ def scene_distance(cameras: Mapping[str, Camera], points: npt.NDArray[np.floatin
 
     Without points: the largest distance between two cameras.
     """
-    depths = []
-    for camera in cameras.values():
-        if points is not None and len(points):
-            depth = np.asarray(points, np.float64) @ camera.rotation[2] + camera.translation[2]
-            if (depth > 0).any():
-                depths.append(float(np.median(depth[depth > 0])))
-    if depths:
-        return float(np.median(depths))
+    depth = scene_depth(points, cameras.values()) if points is not None else None
+    if depth is not None:
+        return depth
     centres = np.array([camera.centre for camera in cameras.values()])
     return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
 

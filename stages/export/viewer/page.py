@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.space.scale import NO_SCALE
+from pipeline.geometry.world import scene_depth
 from stages.export.pictures.orbits import Orbit
 from stages.export.splats import PER_ROW, texels, visible
 from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
@@ -128,15 +129,11 @@ def rasterizer_constants(gaussians: Gaussians, cameras: Sequence[Camera]) -> dic
     from stages.splatting.rasterizer import ALPHA_CUT, LOW_PASS
     from stages.splatting.rendering import NEAR_FRACTION
 
-    depths = []
-    for camera in cameras:
-        z = gaussians.means @ camera.rotation[2] + camera.translation[2]
-        depths.extend([float(np.median(z[z > 0]))] if (z > 0).any() else [])
     return {
         "low_pass": float(LOW_PASS),
         "alpha_min": float(ALPHA_CUT),
         "alpha_max": float(ALPHA_MAX),
-        "near": NEAR_FRACTION * (float(np.median(depths)) if depths else 1.0),
+        "near": NEAR_FRACTION * (scene_depth(gaussians.means, cameras) or 1.0),
         "slope_margin": SLOPE_MARGIN,
     }
 
