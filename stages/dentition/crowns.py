@@ -115,30 +115,31 @@ def with_outlines(dentition: Dentition, outlines: Sequence[Outline]) -> Dentitio
     return replace(made, on_jaws=dentition.on_jaws, mirrored=dentition.mirrored)
 
 
-def mirrored_dentition(dentition: Dentition) -> Dentition:
+def mirrored_dentition(dentition: Dentition, said_too: bool = False) -> Dentition:
     """The teeth in the picture turned over: those of a mirror image as they are.
 
-    Numbers that a person has said (doubt 0) are the patient's, whatever the picture shows.
+    Numbers that a person has said (doubt 0) are the patient's, whatever the picture shows: only
+    with `said_too` they become those of the other side like all others.
     """
     width = dentition.size[0]
     return replace(
         dentition,
         kind={"right": "left", "left": "right"}.get(dentition.kind, dentition.kind),
-        upper=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.upper)),
-        lower=tuple(_mirrored_crown(crown, width) for crown in reversed(dentition.lower)),
+        upper=tuple(_mirrored_crown(c, width, said_too) for c in reversed(dentition.upper)),
+        lower=tuple(_mirrored_crown(c, width, said_too) for c in reversed(dentition.lower)),
         roll=-dentition.roll,
         on_jaws=moved_polygons(dentition.on_jaws, lambda polygon: _turned_over(polygon, width)),
         mirrored=True,
     )
 
 
-def _mirrored_crown(crown: Crown, width: int) -> Crown:
+def _mirrored_crown(crown: Crown, width: int, said_too: bool) -> Crown:
     def over(point: Array | None) -> Array | None:
         return None if point is None else np.array([width - point[0], point[1]])
 
     zenith, tip = over(crown.zenith), over(crown.tip)
     assert zenith is not None and tip is not None
-    guessed = crown.number and crown.doubt > 0
+    turns = crown.number and (crown.doubt > 0 or said_too)
     return replace(
         crown,
         zenith=zenith,
@@ -151,7 +152,7 @@ def _mirrored_crown(crown: Crown, width: int) -> Crown:
         cut_right=crown.cut_left,
         outline=_turned_over(crown.outline, width),
         numbers={other_side(tooth): share for tooth, share in crown.numbers.items()},
-        number=other_side(crown.number) if guessed else crown.number,
+        number=other_side(crown.number) if turns else crown.number,
     )
 
 

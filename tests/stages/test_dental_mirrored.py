@@ -13,7 +13,8 @@ from pipeline.artifacts.dental.fdi import JAWS, permanent_of
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
-from stages.dentition.crowns import mirrored_dentition
+from stages.dentition.corrections import split_polygon
+from stages.dentition.crowns import mirrored_dentition, outline_of, with_outlines
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.config import InitConfig
 from stages.init.dental.cameras.held import HeldCameras, held_cameras
@@ -86,6 +87,24 @@ def test_evidence_is_for_the_mirror_image_where_it_is_one() -> None:
     dentitions[1], labels[1] = mirrored_dentition(dentitions[1]), mirrored_labels(labels[1])
     # The same two readings are compared, the other way around.
     assert evidence(dentitions, labels)[1] == pytest.approx(-straight[1], abs=0.5)
+
+
+def test_evidence_where_a_person_has_numbered_one_part_of_a_crown() -> None:
+    """The other part looks like the same tooth, in the picture turned over like the other side's."""
+    dentitions, labels = case().dentitions(), true_labels(case())
+    front, place = dentitions[1], labels[1][0].index(position_of(13))
+    outlines = [outline_of(crown) for crown in front.all_crowns]
+    polygon = outlines[place].polygon
+    x, y = polygon.mean(axis=0)
+    one, other = split_polygon(polygon, np.array([x, y]), np.array([x, y + 1]))
+    if one[:, 0].mean() > x:
+        one, other = other, one
+    part = replace(outlines[place], polygon=one, number=13, doubt=0.0)
+    outlines[place : place + 1] = [part, replace(part, polygon=other, number=0, doubt=1.0)]
+    dentitions[1] = with_outlines(front, outlines)
+    upper = labels[1][0]
+    labels[1] = ((*upper[: place + 1], *upper[place:]), labels[1][1])
+    assert evidence(dentitions, labels)[1] < -MIRRORED
 
 
 def test_evidence_is_about_each_photograph_from_the_front_beside_others() -> None:

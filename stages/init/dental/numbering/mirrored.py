@@ -53,7 +53,8 @@ def mirror_evidence(
         straight = _chosen(labelling, kept, labels)
         turned = _chosen(labelling, kept, labels | {number: mirrored_labels(labels[number])})
         rows = list(scorer.rows)
-        rows[view] = seen_rows(mirrored_dentition(dentitions[view]))
+        # all numbers turn, so that the same crowns may be parts of one
+        rows[view] = seen_rows(mirrored_dentition(dentitions[view], said_too=True))
         other = Scorer(
             rows, scorer.focals, scorer.focal_deviations, scorer.options, scorer.threads,
             None, scorer.primary,
