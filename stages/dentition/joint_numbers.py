@@ -48,6 +48,8 @@ LOOKS_IN_ORDER = 1e-3
 LEAST_DOUBT = 1e-4
 #: How the order of a row counts.
 ROWS = ChainOptions()
+#: Place of a wisdom tooth in its quadrant.
+WISDOM = 8
 #: Number and doubt of what is no tooth.
 NONE = 0, 1.0
 
@@ -178,6 +180,9 @@ def _numbers(
     for tooth, place, sure in named:
         for member in tooth.members:
             result[overlaps.place(member)] = _number(tooth.jaw, place, sure, primary)
+    for group in groups:
+        if wisdom := _said_wisdom(group, crowns):
+            result |= {overlaps.place(k): (wisdom, LEAST_DOUBT) for k in group}
     for k, group in enumerate(groups):
         if whole[k] != k:
             first = groups[whole[k]][0]
@@ -186,6 +191,12 @@ def _numbers(
                 number = result.get(overlaps.place(first), NONE) if same else NONE
                 result[overlaps.place(member)] = number
     return result, primary
+
+
+def _said_wisdom(group: Sequence[int], crowns: Sequence[Crown]) -> int:
+    """The wisdom tooth that a person has said this is, 0: none. Rows have no place for it."""
+    said = (crowns[k].number for k in group if number_is_said(crowns[k]))
+    return next((number for number in said if number % 10 == WISDOM), 0)
 
 
 def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:

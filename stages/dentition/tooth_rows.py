@@ -74,11 +74,12 @@ def believed(crown: Crown) -> Mapping[int, float]:
 
 
 def crown_evidence(crown: Crown, jaw: Jaw, options: ChainOptions) -> Array:
-    """[14] log probability of each position; a person's word leaves no other."""
-    evidence = position_evidence(believed(crown), jaw, options)
+    """[14] log probability of each position; a person's word leaves no other, and none at all to
+    a wisdom tooth, which stands behind the row."""
     if number_is_said(crown):
-        evidence = np.where(evidence < evidence.max(), SAID_OTHERWISE, 0.0)
-    return np.asarray(evidence)
+        said = np.array(teeth_of(jaw)) == permanent_of(crown.number)
+        return np.where(said, 0.0, SAID_OTHERWISE)
+    return position_evidence(crown.numbers, jaw, options)
 
 
 def row_probabilities(

@@ -345,6 +345,12 @@ def test_a_number_that_a_person_has_said_is_kept() -> None:
     assert result.views[1].upper_doubts[2] < 0.001
 
 
+def test_a_wisdom_tooth_that_a_person_has_said_is_none_of_the_row() -> None:
+    dentitions, _, teeth = three()
+    dentitions[0] = with_crown(dentitions[0], 0, number=18, doubt=0.0)
+    assert fit(dentitions, QUICK).views[0].upper == (0, *teeth[0][0][1:])
+
+
 def test_a_number_that_nobody_is_sure_of_binds_nothing() -> None:
     dentitions, _, teeth = three()
     dentitions[1] = with_crown(dentitions[1], 2, number=teeth[1][0][3], doubt=0.01)

@@ -90,7 +90,7 @@ def test_evidence_is_for_the_mirror_image_where_it_is_one() -> None:
 
 
 def test_evidence_where_a_person_has_numbered_one_part_of_a_crown() -> None:
-    """The other part looks like the same tooth, in the picture turned over like the other side's."""
+    """The other part looks like the same tooth; turned over, like that of the other side."""
     dentitions, labels = case().dentitions(), true_labels(case())
     front, place = dentitions[1], labels[1][0].index(position_of(13))
     outlines = [outline_of(crown) for crown in front.all_crowns]

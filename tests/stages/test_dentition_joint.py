@@ -89,6 +89,19 @@ def test_what_a_person_said_of_one_photograph_counts_for_all() -> None:
     assert [c.doubt for c in found[0].upper if c.number == 15] == [0.0]
 
 
+def test_a_wisdom_tooth_that_a_person_said_is_one_in_all_photographs() -> None:
+    """Here both molars before it are gone, and nothing else moves."""
+    cameras, views, read = wall.case()
+    read = [replace(d, upper=tuple(c for c in d.upper if c.number != 17)) for d in read]
+    shown = [16 in numbers_of(dentition) for dentition in read]
+    assert shown[:2] == [True, True]
+    upper = tuple(replace(c, doubt=0.0, number=18) if c.number == 16 else c for c in read[0].upper)
+    found = agreed(cameras, views, [replace(read[0], upper=upper), *read[1:]])
+    for camera, dentition in zip(cameras, found, strict=True):
+        truth = [number for number in wall.truth_of(camera) if number != 17]
+        assert numbers_of(dentition) == [18 if number == 16 else number for number in truth]
+
+
 @pytest.mark.parametrize(("primary", "number"), [(0.003, 15), (0.5, 55)])
 def test_a_primary_tooth_among_permanent_ones_must_look_the_more_like_it(
     primary: float, number: int

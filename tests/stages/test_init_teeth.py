@@ -115,12 +115,13 @@ def test_the_numbers_of_all_photographs_together_are_handed_on(tmp_path, monkeyp
 
 
 def test_primary_teeth_get_their_own_numbers_and_what_a_person_said_is_not_doubted():
+    """Not even where it is a tooth that the arch does not have."""
     found = found_teeth()
-    object.__setattr__(found.fit, "primary", frozenset({12, 41}))
-    said = replace(read_teeth().views[0].upper[0], doubt=0.0)
+    object.__setattr__(found.fit, "primary", frozenset({11, 41}))
+    said = replace(read_teeth().views[0].upper[0], number=18, doubt=0.0)
     before = replace(read_teeth().views[0], upper=(said, *read_teeth().views[0].upper[1:]))
     after = with_numbers(before, found.fit.views[0], found.fit)
-    assert [crown.number for crown in after.upper] == [52, 11, 21]
+    assert [crown.number for crown in after.upper] == [18, 51, 21]
     assert [crown.number for crown in after.lower] == [81, 0, 31]
     assert [crown.doubt for crown in after.upper] == [0, 0, 0]
     assert with_numbers(before, None, found.fit) is before

@@ -15,6 +15,7 @@ from pipeline.errors import ReconstructionError
 from stages.dentition.crowns import mirrored_dentition
 from stages.dentition.overlay import labelled_overlay, sheet
 from stages.dentition.parts import joined_parts
+from stages.dentition.tooth_rows import number_is_said
 from stages.dentition.working import resized_dentition, working_scale, working_view
 from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
@@ -217,17 +218,19 @@ def _resized(dentition: Dentition | None, view: View) -> Dentition | None:
 
 
 def with_numbers(dentition: Dentition, placed: PlacedView | None, fit: ArchFit) -> Dentition:
-    """The dentition with the numbers that all photographs together give its crowns."""
+    """The dentition with the numbers that all photographs together give its crowns, but for those
+    that a person has said."""
     if placed is None:
         return dentition
     rows: dict[Jaw, tuple[Crown, ...]] = {}
     for jaw, doubts in zip(JAWS, (placed.upper_doubts, placed.lower_doubts), strict=True):
         rows[jaw] = tuple(
-            replace(crown, number=fit.number_of(tooth), doubt=doubt if crown.doubt else 0.0)
+            crown if number_is_said(crown)
+            else replace(crown, number=fit.number_of(tooth), doubt=doubt)
             for crown, tooth, doubt in zip(
                 dentition.crowns(jaw), placed.teeth(jaw), doubts, strict=True
             )
-        )
+        )  # fmt: skip
     return replace(dentition, upper=rows["upper"], lower=rows["lower"])
 
 
