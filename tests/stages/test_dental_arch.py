@@ -361,7 +361,7 @@ def test_numbers_that_contradict_are_refused() -> None:
     dentitions, _, teeth = three()
     for index, tooth in ((2, teeth[1][0][4]), (3, teeth[1][0][2])):
         dentitions[1] = with_crown(dentitions[1], index, number=tooth, doubt=0.0)
-    with pytest.raises(RequestError, match="contradict"):
+    with pytest.raises(RequestError, match="given for photo 1 contradict"):
         fit(dentitions, SHORT)
 
 

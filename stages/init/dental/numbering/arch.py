@@ -138,7 +138,7 @@ def fit_arch(
     rolls = [dentition.roll for dentition in read]
     held = None if cameras is None else held_cameras([cameras[i] for i in placeable], rolls)
     scorer = Scorer(rows, focal, deviation, replace(inner, order=None), threads, held)
-    best, others = _label(scorer, fixed, progress)
+    best, others = _label(scorer, fixed, shown, progress)
     if inner.order is not None:
         best, others, scorer, contradiction = _keep_order(
             Scorer(rows, focal, deviation, inner, threads, held), fixed, scorer, best,
@@ -152,7 +152,7 @@ def fit_arch(
         # A child's arch may tell another numbering than an adult's.
         childs = [(as_a_childs(upper), as_a_childs(lower)) for upper, lower in rows]
         child = Scorer(childs, focal, deviation, scorer.options, threads, held, ALL_PRIMARY)
-        rival, rivals = _label(child, fixed, progress)
+        rival, rivals = _label(child, fixed, shown, progress)
         rival_cost, rival_primary = primary_teeth(child, rival, read)
         if rival_cost < cost:
             scorer, best, others, primary = child, rival, rivals, rival_primary
@@ -236,7 +236,9 @@ def _focal_priors(
     return np.array(values, np.float64), np.array(deviations, np.float64)
 
 
-def _label(scorer: Scorer, fixed: Fixed, progress: Progress) -> tuple[Scored, list[Scored]]:
+def _label(
+    scorer: Scorer, fixed: Fixed, photos: list[str], progress: Progress
+) -> tuple[Scored, list[Scored]]:
     """The best labelling of all views and others that were solved."""
     count = len(scorer.rows)
     candidates = {}
@@ -246,8 +248,9 @@ def _label(scorer: Scorer, fixed: Fixed, progress: Progress) -> tuple[Scored, li
         candidates[view] = view_candidates(scorer, view, roles, fixed)
         if not candidates[view]:
             raise RequestError(
-                "The tooth numbers given for one photograph contradict each other: from left to "
-                "right each crown is the next tooth of its row."
+                f"The tooth numbers given for {photos[view]} contradict each other: from left to "
+                "right each crown is the next tooth of its row; only two that touch may have the "
+                "same number, as parts of one."
             )
     progress("numbering the teeth", 0, 1)
     found = search(scorer, candidates)
@@ -293,7 +296,7 @@ def _keep_order(
     progress: Progress,
 ) -> tuple[Scored, list[Scored], Scorer, list[str]]:
     """Hold the order given, unless the teeth clearly say otherwise: then say what is wrong."""
-    best, others = _label(ordered, fixed, progress)
+    best, others = _label(ordered, fixed, photos, progress)
     given = best.labelling.roles
     found = free_best.labelling.roles
     if found == given or free_best.score > best.score - ordered.options.min_margin:
