@@ -127,6 +127,23 @@ def test_primary_teeth_get_their_own_numbers_and_what_a_person_said_is_not_doubt
     assert with_numbers(before, None, found.fit) is before
 
 
+@pytest.mark.parametrize(
+    ("names", "wrong", "mirrors"),
+    [
+        (["wright_1.jpg", "wright_2.jpg", "wright_3.jpg"], 0, False),
+        (["right.jpg", "front.jpg", "left.jpg"], 0, False),
+        (["right.jpg", "front.jpg", "right2.jpg"], 1, False),
+        (["left.jpg", "front.jpg", "right.jpg"], 2, True),
+        (["left.jpg", "a.jpg", "b.jpg"], 1, True),
+    ],
+)
+def test_names_that_say_the_other_side_are_said_once(names, wrong, mirrors):
+    """Where all do, all photographs may be mirror images."""
+    said = place.misnamed(names, found_teeth())
+    assert len(said) == wrong
+    assert ("all photographs are mirror images" in " ".join(said)) == mirrors
+
+
 def test_photographs_set_aside_take_no_part_unless_their_order_is_given(tmp_path, monkeypatch):
     asked = []
     read = read_teeth(aside=(1,))

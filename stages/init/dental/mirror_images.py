@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -98,6 +99,10 @@ def _is_said(dentition: Dentition) -> bool:
 
 
 def says_side(name: str) -> str:
-    """`right` or `left` where a file's name says one of them, "" otherwise."""
-    said = [side for side in SIDES if side in name.lower()]
+    """`right` or `left` where a file's name says one of them, "" otherwise.
+
+    A word or part of one in camel case: Wright and cleft say nothing.
+    """
+    begins = "(?<![A-Za-z])|(?<=[a-z])(?=[A-Z])"
+    said = [side for side in SIDES if re.search(f"(?:{begins})(?i:{side})", name)]
     return said[0] if len(said) == 1 else ""

@@ -18,6 +18,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
 from stages.init.config import DentalConfig, InitConfig
+from stages.init.dental.mirror_images import SIDES, says_side
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.read import labelled_teeth, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
@@ -164,16 +165,23 @@ def of_several_days(views: Views, names: list[str]) -> list[str]:
 
 def misnamed(names: list[str], teeth: Reconstruction) -> list[str]:
     """What to say of photographs whose names call them the other side than their teeth show."""
-    other = {"right": "left", "left": "right"}
-    return [
-        f"{name} shows the patient's {placed.role} side by its teeth, although its name says "
-        f"{other[placed.role]}; the teeth are believed."
+    sides = [
+        (name, placed.role)
         for name, placed in zip(names, teeth.fit.views, strict=True)
-        if placed is not None
-        and placed.role in other
-        and other[placed.role] in name.lower()
-        and placed.role not in name.lower()
+        if placed is not None and placed.role in SIDES and says_side(name)
     ]
+    wrong = [
+        f"{name} shows the patient's {role} side by its teeth, although its name says "
+        f"{SIDES[role]}; the teeth are believed."
+        for name, role in sides if says_side(name) != role
+    ]  # fmt: skip
+    if wrong and len(wrong) == len(sides):
+        wrong[-1] += (
+            " If it is not the names that are wrong, all photographs are mirror images (taken in a "
+            "mirror, or turned over by a phone), and left and right are wrong in the whole scene: "
+            "say of each on the page check.html that it is one."
+        )
+    return wrong
 
 
 def _write(
