@@ -57,7 +57,7 @@ def views(names: Sequence[str] = NAMES, corner: tuple[int, int] = (0, 0)) -> Vie
     return Views(
         tuple(
             View(f"{k:03d}", image, working_from_source=np.diag([1 / SCALE, 1 / SCALE, 1.0]) @ cut,
-                 source_size=size, source_name=name)
+                 source_size=size, source_name=name, source_sha256=f"{k}" * 64)
             for k, name in enumerate(names)
         )
     )  # fmt: skip

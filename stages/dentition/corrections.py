@@ -45,7 +45,8 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
         to correct. Those of mirror images are of the pictures turned over.
 
     Raises:
-        RequestError: a photograph or a crown that isn't there; the message names it.
+        RequestError: a photograph or a crown that isn't there, or another picture than what was
+            said is of; the message names it.
     """
     if not corrections:
         return teeth
@@ -83,6 +84,13 @@ def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, Pho
             raise RequestError(
                 f"{corrections.file}: '{found[names[label]][0]}' and '{label}' are the same "
                 "photograph; say it once."
+            )
+        if not photo.is_of(views.by_name()[names[label]].source_sha256):
+            raise RequestError(
+                f"{corrections.file}, photograph '{label}': what it says is of another picture, "
+                "which had this name. Take it out of the file and run again: check.html then shows "
+                "the picture that is there now. If it is the same one, saved anew, take out its "
+                "line sha256 alone."
             )
         found[names[label]] = label, photo
     return found

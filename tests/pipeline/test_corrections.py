@@ -21,6 +21,7 @@ from pipeline.artifacts.dental.corrections import (
     read_corrections,
 )
 from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.store import Store
 from stages.dentition.corrections import LEFT_OUT, apply_corrections, area, split_polygon
@@ -38,6 +39,7 @@ photographs:
       - {at: [412, 300.5], tooth: 16}
       - {at: [1, 2], remove: true}
       - {at: [3, 4], split: [[1, 2], [3, 4.5]]}
+    sha256: 5f8e0c1b7a29d364
   "001": {use: false, mirrored: false}
   1.jpg:
 """
@@ -56,6 +58,7 @@ def test_what_the_page_writes_is_read(tmp_path: Path) -> None:
         "1.jpg": PhotoCorrection(),
     }
     assert found
+    assert [photo.sha256 for photo in found.photographs.values()] == ["5f8e0c1b7a29d364", "", ""]
 
 
 @pytest.mark.parametrize(
@@ -92,6 +95,8 @@ def one(entry: str) -> str:
         ("photographs: {a.jpg: {mirrored: yes}}", "mirrored must be true or false, not 'yes'"),
         ("photographs: {a.jpg: {mirrored: [true]}}", "mirrored must be true or false"),
         ("photographs: {a.jpg: {mirored: true}}", "'mirored' .*Did you mean 'mirrored'"),
+        ("photographs: {a.jpg: {sha256: 12345678}}", "sha256 must be .* in quotes, not 12345678"),
+        ("photographs: {a.jpg: {sha256: xyz}}", "sha256 must be up to 64 digits 0-9 and a-f"),
         ("photographs: {a.jpg: {kind: rigth}}", "kind must be.*Did you mean 'right'"),
         ("photographs: {a.jpg: {crowns: {at: 1}}}", "crowns must be a list"),
         (one("{tooth: 11}"), r"crowns\[0\] must say where the crown is"),
@@ -335,6 +340,15 @@ def test_unknown_and_doubled_photographs_are_refused() -> None:
         applied(O_right_jpg=PhotoCorrection(use=True))
     with pytest.raises(RequestError, match=r"'000' and '0_right.jpg' are the same photograph"):
         applied(v000=PhotoCorrection(use=True), v0_right_jpg=PhotoCorrection(use=False))
+
+
+def test_what_was_said_of_another_picture_of_that_name_is_refused() -> None:
+    photo = PhotoCorrection(use=False, sha256="1" * 16)
+    assert applied(v001=photo)[1].set_aside == LEFT_OUT
+    with pytest.raises(RequestError, match=r"photograph '0_right.jpg': .* another picture"):
+        applied(v0_right_jpg=photo)
+    unknown = Views(tuple(replace(view, source_sha256="") for view in case.views().views))
+    assert apply_corrections(case.teeth(), unknown, Corrections({"000": photo})).views[0].set_aside
 
 
 @given(

@@ -78,6 +78,16 @@ def test_a_wrong_file_is_said_on_the_page(tmp_path: Path, text: str) -> None:
     assert "could not be drawn" not in (workspace / "report.html").read_text()
 
 
+def test_what_was_said_of_another_picture_of_that_name_is_not_shown(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    other, same = "{use: false, sha256: aaaa}", "{use: false, sha256: '1111'}"
+    text = f"photographs: {{0_right.jpg: {other}, 1_front.jpg: {same}}}"
+    case.write(workspace / "teeth.yaml", text)
+    run_report(workspace)
+    shown = data_of((workspace / "check.html").read_text())["photographs"]
+    assert [photo["earlier"]["use"] for photo in shown] == [None, False, None]
+
+
 PROBE = """
   result.cards = all("article").length;
   result.left = all("#aside figure").map((entry) => entry.textContent);
@@ -260,7 +270,8 @@ def test_a_mirror_image_is_turned_over_in_a_browser(tmp_path: Path) -> None:
     assert result["back"] == as_taken
     assert result["near"] is True
     assert result["files"] == [
-        f'photographs:|  "0_right.jpg":|    mirrored: {said}|' for said in ("true", "false")
+        f'photographs:|  "0_right.jpg":|    mirrored: {said}|    sha256: "{"0" * 16}"|'
+        for said in ("true", "false")
     ]
     assert result["end"] == ["21 62 23 24 31 ? 32 33 34", "61 22 31 32"]
 

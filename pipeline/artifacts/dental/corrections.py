@@ -11,14 +11,17 @@
           - {at: [412, 300], tooth: 16}
           - {at: [80.5, 310], remove: true}
           - {at: [240, 296], split: [[238, 220], [243, 380]]}
+        sha256: 5f8e0c1b7a29d364
 
 Everything is optional. Coordinates are pixels of the photograph as it was taken, turned upright, so
 that they outlive a change of the working size. Crowns are taken in the order given: a crown that
-was split can be numbered below.
+was split can be numbered below. `sha256` begins that of the photograph's file: of another picture
+with the same name nothing here holds.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,6 +41,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 #: Coordinates beyond this are those of no photograph.
 FARTHEST = 1e6
+_DIGITS = re.compile("[0-9a-f]{0,64}")
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,18 @@ class PhotoCorrection:
         kind: what it shows, turned back where it is mirrored.
         mirrored: it is a mirror image, or is none.
         crowns: in the order in which they are put right.
+        sha256: how that of the photograph's file begins, "" where it isn't known.
     """
 
     use: bool | None = None
     kind: Kind | None = None
     mirrored: bool | None = None
     crowns: tuple[CrownCorrection, ...] = ()
+    sha256: str = field(default="", compare=False)
+
+    def is_of(self, sha256: str) -> bool:
+        """May it be of the photograph whose file has this SHA-256 ("": not known)?"""
+        return not sha256 or sha256.startswith(self.sha256)
 
 
 @dataclass(frozen=True)
@@ -135,8 +145,9 @@ def read_corrections(path: Path) -> Corrections:
 
 
 def _photo(entry: object, where: str) -> PhotoCorrection:
-    given = _mapping(entry, where, ("use", "kind", "mirrored", "crowns"))
+    given = _mapping(entry, where, ("use", "kind", "mirrored", "crowns", "sha256"))
     use, kind, crowns = given.get("use"), given.get("kind"), given.get("crowns")
+    sha256 = given.get("sha256", "")
     for name in ("use", "mirrored"):
         if not isinstance(given.get(name), bool | None):
             raise RequestError(f"{where}: {name} must be true or false, not {_shown(given[name])}.")
@@ -148,8 +159,12 @@ def _photo(entry: object, where: str) -> PhotoCorrection:
         )
     if not isinstance(crowns, list | None):
         raise RequestError(f"{where}: crowns must be a list (- {{at: [x, y], tooth: 16}}).")
+    if not isinstance(sha256, str) or not _DIGITS.fullmatch(sha256):
+        raise RequestError(
+            f"{where}: sha256 must be up to 64 digits 0-9 and a-f in quotes, not {_shown(sha256)}."
+        )
     made = [_crown(item, f"{where}, crowns[{k}]") for k, item in enumerate(crowns or [])]
-    return PhotoCorrection(use, kind, given.get("mirrored"), tuple(made))
+    return PhotoCorrection(use, kind, given.get("mirrored"), tuple(made), sha256)
 
 
 def _crown(entry: object, where: str) -> CrownCorrection:

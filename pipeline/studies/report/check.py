@@ -32,6 +32,8 @@ DOUBTFUL = 0.1
 TEMPLATE = "check.html"
 #: Long side in pixels of a photograph on the page, and of one without teeth.
 LARGE, SMALL = 1280, 480
+#: Digits of a photograph's SHA-256 by which the corrections know it.
+DIGITS = 16
 #: Numbers offered for a crown.
 MOST_OFFERED = 5
 #: The setting that names a file of corrections.
@@ -95,7 +97,10 @@ def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
         seen = by_name.get(view.name) or Dentition(view.name, (view.width, view.height), "none")
         names = (view.source_name, view.source_name.rpartition(".")[0], view.name)
         label = next((name for name in names if name in earlier), view.source_name or view.name)
-        photographs.append(_photograph(view, seen, label, earlier.get(label, PhotoCorrection())))
+        said = earlier.get(label, PhotoCorrection())
+        if not said.is_of(view.source_sha256):
+            said = PhotoCorrection()
+        photographs.append(_photograph(view, seen, label, said))
     digest = hashlib.sha256(json.dumps(photographs).encode()).hexdigest()
     return {
         "file": CORRECTIONS, "doubtful": DOUBTFUL, "photographs": photographs, "digest": digest,
@@ -109,6 +114,7 @@ def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrectio
     upright_from_shown = np.linalg.inv(view.working_from_upright)
     return {
         "name": label,
+        "sha256": view.source_sha256[:DIGITS],
         "picture": shown.uri,
         "width": view.width,
         "height": view.height,

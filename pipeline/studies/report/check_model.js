@@ -183,6 +183,7 @@ const yamlOf = (photos) => {
     if (photo.kindSaid !== null) lines.push(`    kind: ${photo.kindSaid}`);
     if (mirroredOf(photo) !== null) lines.push(`    mirrored: ${mirroredOf(photo)}`);
     if (photo.entries.length) lines.push("    crowns:", ...photo.entries.map(entryLine));
+    if (photo.sha256) lines.push(`    sha256: ${quoted(photo.sha256)}`);
   }
   return `${lines.join("\n")}\n`;
 };
