@@ -60,6 +60,12 @@ def save_all(
             cameras = _with_mouth(teeth, placed, cameras, depths)
     if config.length.mm is not None:
         cameras = _scaled(context, views, placed, cameras, depths)
+    elif config.dental.tooth_widths and cameras.scale.source != "tooth_widths":
+        context.warn(
+            "init.dental.tooth_widths is not used: it gives the scale where the teeth themselves "
+            "place the photographs, which was not needed here. Give a length between two spots "
+            "instead (init.length), such as that tooth's width."
+        )
     context.save(cameras)
     context.save(points)
     context.save(Pointmaps(pairs))

@@ -14,11 +14,14 @@ from tests.stages import arch_wall_case as wall
 from tests.teeth_case import write
 
 
-def saved(folder, read, sources=None, placed=5):
+def saved(folder, read, sources=None, placed=5, **dental):
     cameras, views, _ = wall.case()
     everything = Views(tuple(views))
     context = LocalContext(
-        InitConfig(), folder, {"views": everything, "teeth": Teeth(tuple(read))}, sources or {}
+        InitConfig(dental=dental),
+        folder,
+        {"views": everything, "teeth": Teeth(tuple(read))},
+        sources or {},
     )
     depths = [wall.depth_of(camera) for camera in cameras[:placed]]
     none = np.zeros((0, 3), np.float32)
@@ -59,6 +62,14 @@ def test_what_a_person_said_in_one_photograph_is_followed_in_the_others(tmp_path
     teeth = saved(tmp_path, read, sources).result("teeth")
     assert 55 in numbers_of(teeth.views[0])
     assert 15 not in numbers_of(teeth.views[0])
+
+
+def test_a_known_width_that_is_not_used_is_said(tmp_path):
+    _, _, read = wall.case()
+    context = saved(tmp_path, read, tooth_widths={11: 8.6})
+    assert context.result("cameras").scale.source == "textbook_teeth"
+    assert ["tooth_widths is not used" in said for said in context.warnings] == [True]
+    assert saved(tmp_path / "none", read).warnings == []
 
 
 def test_without_teeth_nothing_is_written(tmp_path):
