@@ -91,6 +91,7 @@ def test_known_tooth_width_gives_the_scale(tmp_path, monkeypatch):
     assert crown_width(found.fit, 11) == pytest.approx(8.5)
     assert crown_width(found.fit, 16) is None
     assert scale_from_widths(found.fit, {11: 10.2})[0] == pytest.approx(1.2)
+    assert scale_from_widths(found.fit, {51: 6.8})[0] == pytest.approx(0.8)
     assert scale_from_widths(found.fit, {})[0] == 1
     with pytest.raises(RequestError, match="none was seen with both its neighbours"):
         scale_from_widths(found.fit, {16: 10.0})

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.artifacts.dental.fdi import teeth_of
+from pipeline.artifacts.dental.fdi import permanent_of, teeth_of
 from pipeline.errors import RequestError
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit
@@ -38,7 +38,8 @@ def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float,
     """True millimetres per millimetre of the arch frame, and the relative standard deviation.
 
     Args:
-        widths: FDI number -> mesiodistal width in mm; none: the textbook's scale.
+        widths: FDI number -> mesiodistal width in mm, of a primary tooth that stands there as well;
+            none: the textbook's scale.
 
     Raises:
         RequestError: none of these teeth was seen with both its neighbours.
@@ -48,8 +49,8 @@ def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float,
     ratios = {
         tooth: known / measured
         for tooth, known in sorted(widths.items())
-        if tooth in (*teeth_of("upper"), *teeth_of("lower"))
-        and (measured := crown_width(fit, tooth)) is not None
+        if (place := permanent_of(tooth)) in (*teeth_of("upper"), *teeth_of("lower"))
+        and (measured := crown_width(fit, place)) is not None
     }
     if not ratios:
         raise RequestError(
