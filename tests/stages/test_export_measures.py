@@ -115,6 +115,18 @@ def test_an_estimate_needs_no_scale() -> None:
     assert measure_mouth(reading, UP, unsaid) == measure_mouth(reading, UP, five)
 
 
+def test_an_overbite_is_less_sure_where_one_of_the_incisors_is_covered() -> None:
+    """It is that of the others, and too small: the covered one reaches higher."""
+    reading = read_landmarks(*photographed(grown(2, **OPEN)))
+    marks = {key: mark for key, mark in reading.landmarks.items() if key != ("tip", 31)}
+    one = replace(reading, landmarks=marks, covered=reading.covered | {31})
+    both, left = (
+        next(e for e in measure_mouth(r, UP, MM) if e["name"] == "overbite") for r in (reading, one)
+    )
+    assert (both["teeth"], left["teeth"]) == ([11, 21, 31, 41], [11, 21, 41])
+    assert left["uncertainty"] > 1.3 * both["uncertainty"]
+
+
 def test_what_can_not_be_estimated_either_says_why() -> None:
     milk = measured(grown(9, dentition="primary", missing=(), overbite=2.0))["overbite"]
     assert (milk["value"], milk["estimated"]) == (None, None)

@@ -68,7 +68,8 @@ class Rule:
         stands_for: how well what is seen stands for what is meant, a standard deviation as share
             of the size of a tooth: from generated mouths, whose crowns are known, in whole runs.
         signs: what a positive and a negative value are called, where there is a sign.
-        covered: times less sure where the other jaw covers the edge it is measured at.
+        covered: times less sure where the other jaw covers the edge of one of its teeth, at which
+            it is measured then, or which it leaves out: an overbite at the others is too small.
         estimate: what to estimate it at where it can't be measured, or why not; see `covered_bite`.
     """
 
@@ -122,7 +123,7 @@ def measure_mouth(reading: Reading, up: Array, scale: Scale, seed: int = 0) -> l
             if entry["sure"] == "sure":
                 entry["sure"] = "fair"
         elif axes is not None and not missing:
-            covered = bool(teeth & reading.covered)
+            covered = any(_covered(group, reading) for _, group in rule.needs)
             entry |= _measured(rule, teeth, covered, places, axes, draws, scale)
             entry |= _surety(entry["uncertainty"], _doubt(reading, teeth), spacing)
         elif bite:
@@ -355,7 +356,7 @@ RULES = (
     Rule(
         "overbite", "Overbite",
         "how far the upper central incisors reach over the edges of the lower ones",
-        (("tip", (11, 21)), ("tip", (31, 41))), _overbite, 0.08, ("", "open"),
+        (("tip", (11, 21)), ("tip", (31, 41))), _overbite, 0.08, ("", "open"), covered=1.5,
         estimate=covered_bite,
     ),
     Rule(
