@@ -23,6 +23,8 @@ Bool = npt.NDArray[np.bool_]
 
 #: Fixed-point bits of OpenCV's drawing coordinates.
 _SHIFT = 4
+#: Kind of a photograph that was not read: its neighbours in a film show the same teeth.
+UNREAD = "unread"
 #: Decimals of pixels and of probabilities in the file.
 _DECIMALS, _PROBABILITY_DECIMALS = 2, 4
 
@@ -81,7 +83,7 @@ class Dentition:
         name: of the view.
         size: width and height of the working image, pixels.
         kind: what is photographed: `front`, `right` or `left` (buccal), `upper` or `lower`
-            (occlusal), `other`; "none" where no teeth were found.
+            (occlusal), `other`; "none" where no teeth were found, `UNREAD` where nobody looked.
         upper, lower: crowns from left to right (after the roll is taken out).
         roll: radians by which the row of teeth is turned clockwise in the image.
         band_height: pixels from the upper to the lower gum line (median).

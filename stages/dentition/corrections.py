@@ -15,7 +15,7 @@ from pipeline.artifacts.dental.corrections import (
     Place,
 )
 from pipeline.artifacts.dental.fdi import Jaw, is_upper
-from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
 from stages.dentition.crowns import centroid, mirrored_dentition, outline_of, with_outlines
@@ -97,6 +97,11 @@ def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, Pho
 
 
 def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: str) -> Dentition:
+    if dentition.kind == UNREAD and (photo.use or photo.crowns):
+        raise RequestError(
+            f"{where}: its teeth have not been read, for of many photographs only some are. "
+            "--set teeth.method=reader reads every one."
+        )
     mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
     if dentition.mirrored:  # places are pixels of the photograph as it was taken
         dentition = mirrored_dentition(dentition)

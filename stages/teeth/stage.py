@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 14
+    version = 15
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)
@@ -33,7 +33,7 @@ class TeethStage(Stage):
         return {} if config.method == "none" else {"reader.onnx": WEIGHTS}
 
     def run(self, context: StageContext) -> None:
-        from pipeline.artifacts.teeth import Dentition, Teeth
+        from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.dentition.working import resized_dentition, working_view
         from stages.teeth.choose import ChoiceOptions, choose
@@ -41,7 +41,7 @@ class TeethStage(Stage):
 
         config: TeethConfig = context.config
         views = context.load("views").views
-        found = [Dentition(view.name, (view.width, view.height), "none") for view in views]
+        found = [Dentition(view.name, (view.width, view.height), UNREAD) for view in views]
         read = list(range(len(views)))
         if config.method == "auto":  # neighbours in a film show the same teeth
             read = evenly(read, config.most_views)

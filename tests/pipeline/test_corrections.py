@@ -20,7 +20,7 @@ from pipeline.artifacts.dental.corrections import (
     corrections_file,
     read_corrections,
 )
-from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.store import Store
@@ -340,6 +340,16 @@ def test_unknown_and_doubled_photographs_are_refused() -> None:
         applied(O_right_jpg=PhotoCorrection(use=True))
     with pytest.raises(RequestError, match=r"'000' and '0_right.jpg' are the same photograph"):
         applied(v000=PhotoCorrection(use=True), v0_right_jpg=PhotoCorrection(use=False))
+
+
+def test_what_was_said_of_a_photograph_that_was_not_read_is_refused() -> None:
+    first, *others = case.teeth().views
+    unread = Teeth((Dentition(first.name, first.size, UNREAD), *others))
+    number = PhotoCorrection(crowns=(CrownCorrection((5, 5), tooth=11),))
+    for photo in (number, PhotoCorrection(use=True)):
+        with pytest.raises(RequestError, match=r"'0_right.jpg': its teeth have not been read"):
+            applied(unread, v0_right_jpg=photo)
+    assert applied(unread, v0_right_jpg=PhotoCorrection(use=False))[0].set_aside == LEFT_OUT
 
 
 def test_what_was_said_of_another_picture_of_that_name_is_refused() -> None:

@@ -61,7 +61,7 @@ def test_of_a_film_some_frames_are_read_from_end_to_end(tmp_path: Path, asked: l
     numbers = [int(name) for name in asked]
     assert (len(numbers), numbers[0], numbers[-1]) == (12, 0, COUNT - 1)
     assert set(np.diff(numbers)) <= {2, 3}
-    assert [d.kind for d in teeth.views if d.name not in asked] == ["none"] * (COUNT - 12)
+    assert [d.kind for d in teeth.views if d.name not in asked] == ["unread"] * (COUNT - 12)
 
 
 def test_the_reader_can_be_told_to_read_all_of_it_or_nothing(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.dental.corrections import Corrections, read_corrections
-from pipeline.artifacts.teeth import Teeth
+from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.store import Store
 from pipeline.studies.report import run_report
 from stages.dentition.corrections import apply_corrections
@@ -86,6 +86,16 @@ def test_what_was_said_of_another_picture_of_that_name_is_not_shown(tmp_path: Pa
     run_report(workspace)
     shown = data_of((workspace / "check.html").read_text())["photographs"]
     assert [photo["earlier"]["use"] for photo in shown] == [None, False, None]
+
+
+def test_photographs_that_were_not_read_are_not_shown_but_for_what_was_said(tmp_path: Path) -> None:
+    read = case.teeth().views
+    unread = [Dentition(view.name, view.size, UNREAD) for view in read[1:]]
+    workspace = doubtful_case(tmp_path / "case", Teeth((read[0], *unread)))
+    case.write(workspace / "teeth.yaml", "photographs: {1_front.jpg: {use: false}}")
+    run_report(workspace)
+    shown = data_of((workspace / "check.html").read_text())["photographs"]
+    assert [photo["aside"] for photo in shown] == ["", "its teeth have not been read"]
 
 
 PROBE = """

@@ -18,7 +18,7 @@ from pipeline.artifacts.dental.corrections import (
     corrections_file,
     read_corrections,
 )
-from pipeline.artifacts.teeth import Crown, Dentition, Teeth
+from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views, to_uint8
 from pipeline.errors import PipelineError
 from pipeline.pages.case import Case
@@ -36,6 +36,7 @@ LARGE, SMALL = 1280, 480
 DIGITS = 16
 #: Numbers offered for a crown.
 MOST_OFFERED = 5
+_NOTHING = ("no teeth were found in it", "its teeth have not been read")
 #: The setting that names a file of corrections.
 LABELS = "init.dental.labels"
 
@@ -97,6 +98,8 @@ def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
         seen = by_name.get(view.name) or Dentition(view.name, (view.width, view.height), "none")
         names = (view.source_name, view.source_name.rpartition(".")[0], view.name)
         label = next((name for name in names if name in earlier), view.source_name or view.name)
+        if seen.kind == UNREAD and label not in earlier:
+            continue  # there is nothing to check
         said = earlier.get(label, PhotoCorrection())
         if not said.is_of(view.source_sha256):
             said = PhotoCorrection()
@@ -123,7 +126,7 @@ def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrectio
         "mirrored": bool(seen.mirrored),
         "roll": round(float(seen.roll), 4),
         "kind": seen.kind,
-        "aside": seen.set_aside or ("" if seen.all_crowns else "no teeth were found in it"),
+        "aside": seen.set_aside or ("" if seen.all_crowns else _NOTHING[seen.kind == UNREAD]),
         "doubts": list(seen.doubts),
         "crowns": [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3],
         "earlier": _entries(earlier),
