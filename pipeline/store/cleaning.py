@@ -7,6 +7,7 @@ from pathlib import Path
 
 from filelock import Timeout
 
+from pipeline.store.failures import EVIDENCE, FAILURE
 from pipeline.store.locks import LOCK, lock_of
 from pipeline.store.places import ASIDE, is_folder, is_there, remove, size_of
 
@@ -17,13 +18,18 @@ SCRATCH = "scratch"
 
 
 def clean(
-    root: Path, keep: int, in_use: Callable[[str], str], spare: Collection[str], manifest: str
+    root: Path,
+    keep: int,
+    in_use: Callable[[str], str | None],
+    spare: Collection[str],
+    manifest: str,
 ) -> tuple[list[str], int]:
     """Delete what is not in use from the folders of a workspace that nobody is working in.
 
     Args:
         keep: so many of the newest other results of each stage stay.
-        in_use: stage -> name of the folder of the result in use.
+        in_use: stage -> name of the folder of the result in use; None: that is not known any more,
+            and all of its results stay.
         spare: names (``stage/folder``) of what stays besides.
         manifest: name of the file that makes a folder a result.
 
@@ -72,12 +78,15 @@ def holds_checkpoint(partial: Path) -> bool:
     return is_folder(scratch) and any(path.suffix != ".tmp" for path in scratch.iterdir())
 
 
-def _unused(folder: Path, keep: int, in_use: str, manifest: str) -> list[Path]:
+def _unused(folder: Path, keep: int, in_use: str | None, manifest: str) -> list[Path]:
     entries = [path for path in folder.iterdir() if is_folder(path) or ASIDE in path.name]
+    if is_there(folder / FAILURE):  # which names what is kept there
+        entries = [path for path in entries if path.name != EVIDENCE]
     whole = [path for path in entries if (path / manifest).is_file() and "." not in path.name]
     others = sorted(
         (path for path in whole if path.name != in_use),
         key=lambda path: ((path / manifest).stat().st_mtime_ns, path.name),
         reverse=True,
     )
-    return [path for path in entries if path not in whole] + others[keep:]
+    others = others[keep:] if in_use is not None else []
+    return [path for path in entries if path not in whole] + others

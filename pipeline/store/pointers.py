@@ -56,6 +56,14 @@ class Pointers:
         keys = [k for k in keys if isinstance(k, str) and (folder / k[:KEY_LENGTH]).is_dir()]
         return {"key": keys[0], "reasons": []} if len(keys) == 1 else None
 
+    def is_known(self, stage: str) -> bool:
+        """Can it be told which result is in use, or that none is?"""
+        try:
+            self.require(stage)
+        except RequestError:
+            return False
+        return True
+
     def require(self, stage: str) -> None:
         """Nothing, if it can be told which result is in use, or that none is.
 

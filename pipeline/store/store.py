@@ -325,9 +325,11 @@ class Store:
             RequestError: the workspace can't be written to.
         """
 
-        def in_use(stage: str) -> str:
+        def in_use(stage: str) -> str | None:
             pointer = self.pointer(stage)
-            return pointer["key"][:KEY_LENGTH] if pointer else ""
+            if pointer is not None:
+                return pointer["key"][:KEY_LENGTH]
+            return "" if self._pointers.is_known(stage) else None
 
         try:
             remove_leftovers(self.root)

@@ -211,6 +211,15 @@ def test_a_damaged_pointer_among_several_results(run: Any, toys: Path) -> None:
     assert run(QUIET, stages=["count"], images=()) == {"count": "cached"}
 
 
+def test_clean_leaves_alone_what_may_be_in_use(run: Any, toys: Path) -> None:
+    run(QUIET)
+    run(QUIET, "scale.factor=3")
+    flip(toys / "w" / "scale" / "current.json")
+    removed, _ = pipeline.clean(toys / "w")
+    assert {name.partition("/")[0] for name in removed} == {"count", "publish"}
+    assert run(QUIET, "scale.factor=3") == CACHED
+
+
 def test_a_flipped_byte_in_the_request(run: Any, toys: Path) -> None:
     run(QUIET)
     request = toys / "w" / "request.json"

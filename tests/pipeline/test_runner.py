@@ -228,6 +228,8 @@ def test_pictures_of_a_failure_are_kept_until_a_run_succeeds(run: Any, toys: Pat
         run("count.fail=data")
     picture = read_png(folder / "pair.png")
     assert picture.shape == (4, 6, 3) and (picture == 77).all()
+    pipeline.clean(toys / "w")  # which leaves the message that names them as well
+    assert (folder / "pair.png").exists()
     run()
     assert not folder.exists()
 
