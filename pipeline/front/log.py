@@ -74,7 +74,8 @@ class Log(Reporter):
                 "a", encoding="utf-8", errors="backslashreplace"
             )  # fmt: skip
             self.path = folder / name
-            for old in sorted(folder.glob("run_*.log"))[:-KEPT]:
+            others = [path for path in sorted(folder.glob("run_*.log")) if path != self.path]
+            for old in others[: len(others) + 1 - KEPT]:  # a clock set back would name this one
                 old.unlink(missing_ok=True)
         except OSError as error:
             if self._stream is None:

@@ -43,6 +43,11 @@ def test_each_run_leaves_a_log(run: Any, toys: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(log, "KEPT", 1)
     run()
     assert len(logs(toys)) == 1, "the newest stay"
+    [last] = (toys / "w" / "logs").iterdir()
+    last.rename(last.with_name("run_2999-01-01_000000_1.log"))  # since then the clock was set back
+    run("scale.factor=4")
+    [text] = logs(toys)
+    assert "scale.factor=4" in text
 
 
 def test_a_fault_comes_with_its_trace(
