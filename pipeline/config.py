@@ -180,7 +180,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise RequestError(
-            f"--set takes stage.key=value, as 'pipeline stages' lists them; this is {shown(text)}."
+            f"--set takes stage.key=value, as 'pipeline settings' has them; this is {shown(text)}."
         )
     try:
         return key.strip(), plain_yaml(value, "it")
@@ -200,6 +200,8 @@ def anchored(change: str) -> str:
         value = plain_yaml(text, "it")
     except RequestError:
         return change
+    if type(value) in (int, float):  # a folder may be called 2024
+        value = text.strip()
     if field is None or not names_path(field) or not isinstance(value, str):
         return change
     if not value or value.startswith("~"):
@@ -263,7 +265,22 @@ def validate(model: type[Model], values: Any, section: str) -> Model:
     for dotted, value in _whole_numbers(read, section):
         if abs(value) >= 2**63:
             raise RequestError(f"{dotted}={shown(value)} is not allowed: no count is so large.")
+    for dotted in _truths_as_numbers(values, read, section):
+        raise RequestError(f"{dotted} is not allowed: it is a number.")
     return read
+
+
+def _truths_as_numbers(given: Any, read: Any, dotted: str) -> Iterator[str]:
+    """Dotted name and value of each true or false that was taken for 1 or 0."""
+    if isinstance(given, bool) and type(read) in (int, float):
+        yield f"{dotted}={str(given).lower()}"
+    elif isinstance(given, dict) and isinstance(read, BaseModel):
+        for name, value in given.items():
+            inner = ".".join(filter(None, (dotted, name)))
+            yield from _truths_as_numbers(value, getattr(read, name, None), inner)
+    elif isinstance(given, list | tuple) and isinstance(read, list | tuple):
+        for entries in zip(given, read, strict=False):
+            yield from _truths_as_numbers(*entries, dotted)
 
 
 def _whole_numbers(value: Any, dotted: str) -> Iterator[tuple[str, int]]:

@@ -35,8 +35,9 @@ class StageConfig(BaseModel):
     """Base of every stage's config: frozen, and unknown keys are refused."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False,
+        coerce_numbers_to_str=True,  # a photograph may be called 1
+    )  # fmt: skip
 
 
 def runtime(default: Any, **constraints: Any) -> Any:

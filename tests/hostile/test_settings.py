@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import model_files
 from pipeline.studies.benchmark.suite import load_suite
 from pipeline.studies.compare.models import model_folders
+from pipeline.workspace import make_request
 
 #: Nothing here may take as long as it likes: the bomb would, if it were unfolded.
 pytestmark = pytest.mark.timeout(60)
@@ -119,7 +121,7 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "--set takes stage.key=value"),
+        ("", "as 'pipeline settings' has them"),
         ("=", "--set takes stage.key=value"),
         ("x" * 100_000, "--set takes stage.key=value"),
         ("views.long_side=0x_", "views.long_side='0x_'"),
@@ -145,6 +147,9 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
         ("stages=[" + "x" * 90_000 + "]", "Unknown stage"),
         ("threads=1e9", "threads="),
         ("seed=-1", "seed="),
+        ("seed=true", "seed=true is not allowed: it is a number"),
+        ("fit.iterations=true", "fit.iterations=true is not allowed: it is a number"),
+        ("init.length.start=[true, 2]", "init.length.start=true is not allowed: it is a number"),
     ],
 )
 def test_a_setting_that_is_not_understood_is_refused(text: str, words: str) -> None:
@@ -158,6 +163,13 @@ def test_numbers_that_no_tooth_has_are_refused(tooth: int) -> None:
     assert said.startswith(f"init.dental.labels.0.tooth={tooth} is not allowed: it is no tooth's")
     assert "FDI numbers are 11-18, " in said and "string" not in said
     load_config(None, [given.replace(f"tooth: {tooth}", "tooth: 55")])
+
+
+def test_names_may_be_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = make_request(overrides=["views.masks=1.50", "views.held_out=[1, 02]"], workspace="w")
+    views: Any = load_config(None, asked.overrides).sections["views"]
+    assert (views.masks, views.held_out) == (tmp_path / "1.50", ("1", "02"))
 
 
 def test_presets_that_never_end_are_refused(tmp_path: Path) -> None:
