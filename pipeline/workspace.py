@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import anchored, load_config, yaml_value
+from pipeline.config import Config, RunConfig, anchored, load_config, yaml_value
 from pipeline.errors import PipelineError, RequestError
 from pipeline.planning import plan_chain, resolve_chain
+from pipeline.stage import stage_names
 from pipeline.store import Store, partial_name
 from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, is_there, set_aside
@@ -31,6 +32,7 @@ class Request:
         images: the photographs that the user named, or those that the workspace was last run on.
         images_named: whether the user named them.
         taken_over: what of preset and overrides is the last run's, as the command line has it.
+        left_out: settings of the last run for stages that are not installed here.
     """
 
     workspace: Path
@@ -41,6 +43,7 @@ class Request:
     from_stage: str | None = None
     images_named: bool = True
     taken_over: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def asked(self) -> frozenset[str]:
@@ -116,7 +119,8 @@ def make_request(
         workspace = default_workspace(given)
     folder = Path(workspace)
     images_named = bool(given)
-    taken_over: list[str] = []
+    taken_over: tuple[str, ...] = ()
+    left_out: list[str] = []
     if isinstance(overrides, Mapping):
         overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
     overrides = [anchored(change) for change in overrides]
@@ -128,9 +132,9 @@ def make_request(
             now = list(overrides)
             named = {change.partition("=")[0].strip() for change in now}
             kept = [c for c in remembered["overrides"] if c.partition("=")[0].strip() not in named]
+            kept, left_out = installed_here(kept)
             preset, overrides = remembered["preset"], [*kept, *now]
-            taken_over = [f"-c {preset}"] if preset else []
-            taken_over += [f"--set {change}" for change in kept]
+            taken_over = _as_options(preset, kept)
         given = [p for p in remembered.get("images", []) if _still_there(p)]
     return Request(
         workspace=folder,
@@ -140,8 +144,51 @@ def make_request(
         stages=tuple(stages) if stages else None,
         from_stage=from_stage,
         images_named=images_named,
-        taken_over=tuple(taken_over),
+        taken_over=taken_over,
+        left_out=tuple(left_out),
     )
+
+
+def _as_options(preset: str | Path | None, overrides: Iterable[str]) -> tuple[str, ...]:
+    """A preset and settings as the command line has them."""
+    return (*([f"-c {preset}"] if preset else []), *(f"--set {change}" for change in overrides))
+
+
+def installed_here(settings: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Settings that a workspace remembers: those of stages that are installed, and the others."""
+    known = {"run", *RunConfig.model_fields, *stage_names()}
+    kept: list[str] = []
+    others: list[str] = []
+    for change in settings:
+        section = change.partition("=")[0].partition(".")[0].strip()
+        (kept if section in known else others).append(change)
+    return kept, others
+
+
+def config_of(request: Request) -> Config:
+    """The config that a request comes to.
+
+    Raises:
+        RequestError: it is wrong; where it is the last run's, that is said.
+    """
+    try:
+        return load_config(request.preset, request.overrides)
+    except RequestError as error:
+        before = [c.removeprefix("--set ") for c in request.taken_over if c.startswith("--set ")]
+        if not request.taken_over or _can_be_read(request.preset, before):
+            raise
+        raise RequestError(
+            f"{request.workspace} was run with {' '.join(request.taken_over)} last, which can't be "
+            f"used any more. {error} To start from the defaults instead, add -c dentalsplat."
+        ) from error
+
+
+def _can_be_read(preset: str | None, overrides: Iterable[str]) -> bool:
+    try:
+        load_config(preset, overrides)
+    except RequestError:
+        return False
+    return True
 
 
 def _still_there(path: str) -> bool:
@@ -210,14 +257,24 @@ def status(
     """
     request = make_request(images, workspace, preset, overrides, stages)
     remembered = read_request(request.workspace)
+    if not stages:
+        stages = remembered["stages"]
+        for name in stages or ():
+            if name not in stage_names():
+                raise RequestError(
+                    f"{request.workspace} was run with the stage '{name}' last, which is not "
+                    "installed here any more. Install its package again, or say with --stages "
+                    "which others to look at."
+                )
+    kept: list[str] = []
+    taken_over: tuple[str, ...] = ()
+    if preset is None:
+        preset, (kept, _) = remembered["preset"], installed_here(remembered["overrides"])
+        taken_over = _as_options(preset, kept)
     request = make_request(
-        request.images,
-        request.workspace,
-        preset if preset is not None else remembered["preset"],
-        [*(remembered["overrides"] if preset is None else []), *request.overrides],
-        stages or remembered["stages"],
-    )
-    config = load_config(request.preset, request.overrides)
+        request.images, request.workspace, preset, [*kept, *request.overrides], stages
+    )  # fmt: skip
+    config = config_of(replace(request, taken_over=taken_over))
     store = Store(request.workspace, verify=verify)
     chain = resolve_chain(config, request.stages, request.from_stage, request.images_named, store)
     found = []

@@ -15,7 +15,7 @@ from pipeline.runner import Runner
 from pipeline.running.outcomes import RunSummary
 from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage, stage_names
-from pipeline.workspace import make_request
+from pipeline.workspace import config_of, make_request
 
 
 def run(
@@ -65,12 +65,16 @@ def run(
     request = make_request(
         images, workspace, preset, overrides, stages, from_stage, as_before=True
     )  # fmt: skip
-    config = load_config(request.preset, request.overrides)
+    config = config_of(request)
     reporter = reporter or Reporter()
     if request.taken_over:
         reporter.message(
             f"As in the last run of this workspace: {' '.join(request.taken_over)} "
             "(-c dentalsplat starts from the defaults instead)."
+        )
+    if request.left_out:
+        reporter.message(
+            f"Left out, since the stage is not installed here: {' '.join(request.left_out)}."
         )
     log = None if dry_run else Log(request, reporter)
     reporter = log or reporter

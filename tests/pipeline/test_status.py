@@ -7,8 +7,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import toy
 
 import pipeline
+from pipeline.front.progress import LineReporter
 from pipeline.planning import key_material
 from pipeline.stage import get_stage
 
@@ -64,6 +66,34 @@ def test_stages_never_run_are_missing(run: Any, toys: Path) -> None:
     run(stages=["read", "scale"])
     found = pipeline.status(workspace=toys / "w", stages=["read", "scale", "count"])
     assert [stage.state for stage in found] == ["cached", "cached", "missing"]
+
+
+def test_a_stage_that_is_not_installed_any_more(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("scale.factor=3", stages=["read", "scale"])
+    others = {name: entry for name, entry in toy.STAGES.items() if name != "scale"}
+    monkeypatch.setattr("pipeline.stage._entry_points", lambda: others)
+    get_stage.cache_clear()
+    (toys / "toy.yaml").write_text("stages: [read, count]\nthreads: 1\n")
+    with pytest.raises(pipeline.RequestError, match="run with the stage 'scale' last") as refused:
+        pipeline.status(workspace=toys / "w")
+    assert "package" in str(refused.value) and "Did you mean" not in str(refused.value)
+    [read] = pipeline.status(workspace=toys / "w", stages=["read"])
+    assert read.state == "cached"
+    pipeline.run(workspace=toys / "w", stages=["read"], reporter=LineReporter())
+    assert "not installed here: scale.factor=3" in capsys.readouterr().err
+
+
+def test_what_a_workspace_remembers_may_be_of_no_use_any_more(run: Any, toys: Path) -> None:
+    run("scale.factor=3")
+    (toys / "toy.yaml").unlink()
+    for call in (pipeline.status, pipeline.run):
+        with pytest.raises(pipeline.RequestError, match=r"was run with -c .*toy\.yaml --set scale"):
+            call(workspace=toys / "w")
+    (toys / "toy.yaml").write_text(f"stages: {toy.ORDER}\nthreads: 1\n")
+    with pytest.raises(pipeline.RequestError, match=r"^'scale\.nope' is not a setting"):
+        pipeline.run(workspace=toys / "w", overrides=["scale.nope=3"])
 
 
 def test_unknown_workspace_is_refused(toys: Path) -> None:

@@ -8,7 +8,7 @@ from pipeline.config import Config, load_config
 from pipeline.errors import PipelineError
 from pipeline.pages.case import Case, StageRecord
 from pipeline.store import Result, Store
-from pipeline.workspace import StageStatus, read_request, status
+from pipeline.workspace import StageStatus, installed_here, read_request, status
 
 
 def read_case(workspace: Path) -> Case:
@@ -24,7 +24,8 @@ def read_case(workspace: Path) -> Case:
         store.current(pointer.parent.name)
     notes += store.said
     try:
-        config: Config | None = load_config(request.get("preset"), request.get("overrides", []))
+        settings, _ = installed_here(request["overrides"])
+        config: Config | None = load_config(request["preset"], settings)
     except PipelineError as error:
         config = None
         notes.append(f"The settings of the run can't be resolved any more: {error}")
