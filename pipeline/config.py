@@ -188,8 +188,8 @@ def parse_override(text: str) -> tuple[str, Any]:
         raise RequestError(f"The value of --set {shown(text)} can't be read: {error}") from error
 
 
-def anchored(change: str) -> str:
-    """An override as it holds in every folder: a path in whole.
+def anchored(change: str, begin: str | Path = "") -> str:
+    """An override as it holds in every folder: a path in whole, which begins at this one.
 
     What can't be read stays as it is; `load_config` says what is wrong with it.
     """
@@ -206,7 +206,7 @@ def anchored(change: str) -> str:
         return change
     if not value or value.startswith("~"):
         return change
-    return f"{name}={yaml_value(os.path.abspath(value))}"  # noqa: PTH100 - keeps what is no path
+    return f"{name}={yaml_value(os.path.abspath(Path(begin, value)))}"  # noqa: PTH100
 
 
 def yaml_value(value: Any) -> str:

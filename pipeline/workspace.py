@@ -124,22 +124,21 @@ def make_request(
     if isinstance(overrides, Mapping):
         overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
     overrides = [anchored(change) for change in overrides]
-    if preset is not None and Path(preset).suffix in (".yaml", ".yml") and Path(preset).is_file():
-        preset = Path(preset).absolute()
+    named_preset = anchored_preset(preset)
     if not given:
         remembered = read_request(folder) if is_workspace(folder) else {}
-        if as_before and preset is None and remembered:
+        if as_before and named_preset is None and remembered:
             now = list(overrides)
             named = {change.partition("=")[0].strip() for change in now}
             kept = [c for c in remembered["overrides"] if c.partition("=")[0].strip() not in named]
             kept, left_out = installed_here(kept)
-            preset, overrides = remembered["preset"], [*kept, *now]
-            taken_over = _as_options(preset, kept)
+            named_preset, overrides = remembered["preset"], [*kept, *now]
+            taken_over = _as_options(named_preset, kept)
         given = [p for p in remembered.get("images", []) if _still_there(p)]
     return Request(
         workspace=folder,
         images=tuple(os.path.abspath(p) for p in given),  # noqa: PTH100 - keeps glob characters
-        preset=str(preset) if preset is not None else None,
+        preset=named_preset,
         overrides=tuple(overrides),
         stages=tuple(stages) if stages else None,
         from_stage=from_stage,
@@ -147,6 +146,13 @@ def make_request(
         taken_over=taken_over,
         left_out=tuple(left_out),
     )
+
+
+def anchored_preset(preset: str | Path | None) -> str | None:
+    """A preset as it is named in every folder: a file by its whole path."""
+    if preset is not None and Path(preset).suffix in (".yaml", ".yml") and Path(preset).is_file():
+        preset = Path(preset).absolute()
+    return str(preset) if preset is not None else None
 
 
 def _as_options(preset: str | Path | None, overrides: Iterable[str]) -> tuple[str, ...]:

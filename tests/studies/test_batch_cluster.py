@@ -63,8 +63,8 @@ class Cluster:
 
     def _process(self, *command: str) -> subprocess.Popen[bytes]:
         with (self.folder / "dask.log").open("a") as log:
-            return subprocess.Popen(
-                command, cwd=self.folder, env=self._environment(), stdout=log, stderr=log
+            return subprocess.Popen(  # workers are started in any folder
+                command, cwd="/", env=self._environment(), stdout=log, stderr=log
             )
 
     def _environment(self) -> dict[str, str]:

@@ -124,6 +124,14 @@ def test_a_list_of_cases(tmp_path: Path) -> None:
     assert [Path(path).name for path, _, _ in found[1].files] == ["0.jpg", "1.jpg"]
 
 
+def test_paths_of_a_list_begin_at_its_folder(tmp_path: Path) -> None:
+    pictures(tmp_path / "p")
+    text = "name,photographs,settings\na,p,views.masks=m; views.held_out=[0.jpg]\n"
+    (tmp_path / "list.csv").write_text(text)
+    (case,) = read_cases(tmp_path / "list.csv", Names({}))
+    assert case.overrides == (f"views.masks={tmp_path / 'm'}", "views.held_out=[0.jpg]")
+
+
 def test_a_list_with_what_a_spreadsheet_leaves(tmp_path: Path) -> None:
     pictures(tmp_path / "p")
     text = "name;photographs;settings;;\n;;;;\na;p;;;\n\na;p;;;\nb;p;;;x\n"

@@ -7,6 +7,7 @@ import io
 import re
 from pathlib import Path
 
+from pipeline.config import anchored
 from pipeline.errors import PipelineError, RequestError, nearest
 from pipeline.studies.batch.find import Names, as_case
 from pipeline.studies.batch.records import Case
@@ -94,7 +95,7 @@ def _case(row: dict[str, str], excess: int, number: int, path: Path) -> Case:
     if not images:
         return Case("", called, settled="wrong", reason="It names no photographs.")
     settings = [part.strip() for part in row.get("settings", "").split(SEPARATOR)]
-    overrides = tuple(part for part in settings if part)
+    overrides = tuple(anchored(part, path.parent) for part in settings if part)
     if len(images) == 1 and images[0].is_dir():
         images = _film_in(images[0]) or images
     try:

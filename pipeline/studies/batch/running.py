@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pipeline.config import parse_override
+from pipeline.config import anchored, yaml_value
 from pipeline.errors import RequestError
 from pipeline.files import write_json
 from pipeline.installed import library_version
@@ -35,6 +35,7 @@ from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import run_case, stop
 from pipeline.studies.jobs import only_one
 from pipeline.untrusted.names import readable
+from pipeline.workspace import anchored_preset
 
 Keep = Literal["workspace", "results"]
 KEEPS: tuple[Keep, ...] = get_args(Keep)
@@ -83,17 +84,16 @@ def batch(
             in it, the disk is full, or the scheduler is gone.
     """
     require_dask()
-    pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
-    texts = tuple(f"{key}={_text(value)}" for key, value in pairs)
-    if not isinstance(overrides, Mapping):
-        texts = tuple(overrides)
+    if isinstance(overrides, Mapping):
+        overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
+    texts = tuple(map(anchored, overrides))
     place = Path(cases)
     folder = Path(out) if out is not None else Path("runs") / f"batch_{_called(place)}"
     progress = progress or Silent()
     start = time.perf_counter()
     named = tuple(stages) if stages else None
     common: dict[str, Any] = {
-        "out": str(folder.absolute()), "preset": str(preset) if preset is not None else None,
+        "out": str(folder.absolute()), "preset": anchored_preset(preset),
         "overrides": list(texts), "stages": list(named) if named else None, "keep": keep,
         "memory": _memory_each(memory, jobs, scheduler), "seconds": (minutes or 0) * 60,
         "threads": 0 if scheduler else max(1, usable_cores() // jobs),
@@ -319,13 +319,6 @@ def _gone() -> RequestError:
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
-
-
-def _text(value: Any) -> str:
-    import yaml
-
-    text: str = yaml.safe_dump(value, default_flow_style=True, width=10**6)
-    return text.removesuffix("\n").removesuffix("\n...")
 
 
 def _called(place: Path) -> str:
