@@ -23,6 +23,7 @@ from stages.export.stage import ExportConfig, ExportStage
 from stages.splatting.frame import move_cameras
 from tests.stages import export_scene as scene
 
+ROOT = Path(__file__).parents[2]
 #: our world -> the input's millimetres
 SIMILARITY = np.array([[0, -20, 0, 1], [20, 0, 0, 2], [0, 0, 20, 3], [0, 0, 0, 1.0]])
 IN_MM = Scale("mm", "length", 2.5)
@@ -143,10 +144,26 @@ def test_pymeshlab_is_loaded_in_the_main_thread(tmp_path: Path) -> None:
     # PyMeshLab's Qt belongs to the thread that loads it: once that has ended, the program's own
     # end writes into freed memory (valgrind; `malloc_consolidate(): unaligned fastbin chunk`)
     command = [sys.executable, "-c", WHO_LOADS, str(tmp_path)]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "in the main thread: True\n"
+
+
+ON_A_FULL_DISK = """
+from pathlib import Path
+import numpy as np
+from stages.export.pictures.video import Video
+with Video(Path("/dev/full"), (32, 32), 10, 20, beside=True) as video:
+    for _ in range(9):
+        video.add(np.zeros((48, 32), np.uint8))
+"""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_video_on_a_full_disk_is_an_error_and_no_crash() -> None:
+    command = [sys.executable, "-c", ON_A_FULL_DISK]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1 and "No space left" in done.stderr
 
 
 def test_splats_are_in_the_stated_frame(folder: Path) -> None:

@@ -58,6 +58,7 @@ class Video:
         self._pool = ThreadPoolExecutor(1) if beside else None
         self._waiting: deque[Future[None]] = deque()
         self._added = 0
+        self._failed = False
 
     def __enter__(self) -> Self:
         return self
@@ -90,7 +91,13 @@ class Video:
             self._waiting.popleft().result()
 
     def _encode(self, pixels: npt.NDArray[np.uint8], number: int) -> None:
+        if self._failed:  # the library crashes where the header could not be written
+            return
         frame = av.VideoFrame.from_ndarray(pixels, format="yuv420p")
         frame.pts = number
         frame.time_base = self._time_base
-        self._container.mux(self._stream.encode(frame))
+        try:
+            self._container.mux(self._stream.encode(frame))
+        except BaseException:
+            self._failed = True
+            raise
