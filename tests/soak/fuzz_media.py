@@ -200,10 +200,11 @@ def read(path: Path) -> str:
     from pipeline.errors import RequestError
     from stages.views.find import is_video
     from stages.views.load import load_photos, load_video
+    from stages.views.reading.video import Wanted
 
     try:
         if is_video(path):
-            load_video(path.name, path, None, 3, 128, 16)
+            load_video(path.name, path, None, Wanted(3), 128, 16)
         else:
             load_photos({path.name: path}, {path.name: path}, 128, 16)
     except RequestError as error:
