@@ -56,3 +56,19 @@ def orientation_from_rotation(degrees_counterclockwise: float) -> int:
     """EXIF orientation that does what a film's display matrix does (quarter turns)."""
     quarter = round(degrees_counterclockwise / 90) % 4
     return (1, 8, 3, 6)[quarter]
+
+
+def orientation_from_matrix(rows: tuple[tuple[float, float], tuple[float, float]]) -> int:
+    """EXIF orientation nearest to a film's display matrix, which may also mirror.
+
+    Args:
+        rows: right and down of the upright picture, in terms of right and down of the stored one.
+    """
+
+    (a, c), (b, d) = rows
+
+    def fit(orientation: int) -> float:
+        right, down = _ROWS[orientation]
+        return right[0] * a + right[1] * c + down[0] * b + down[1] * d
+
+    return max(_ROWS, key=fit)

@@ -127,6 +127,10 @@ def test_frames_are_the_same_where_not_all_are_decoded(
         (QUARTER_TURN_CLOCKWISE, 6, (0, -1)),
         ((0, -1, 1, 0), 8, (-1, 0)),
         ((-1, 0, 0, -1), 3, (-1, -1)),
+        ((-1, 0, 0, 1), 2, (0, -1)),  # mirrored
+        ((1, 0, 0, -1), 4, (-1, 0)),
+        ((0, 1, 1, 0), 5, (0, 0)),
+        ((0, -1, -1, 0), 7, (-1, -1)),
     ],
 )
 def test_display_matrix(
@@ -137,7 +141,7 @@ def test_display_matrix(
     assert {frame.orientation for frame in read_frames(path, 4)} == {orientation}
     views, _ = run_stage(tmp_path / "out", path)
     view = views.views[0]
-    assert (view.width, view.height) == ((160, 96) if orientation == 3 else (96, 160))
+    assert (view.width, view.height) == ((160, 96) if orientation < 5 else (96, 160))
     corner = view.image[red]
     assert corner[0] > 0.8
     assert corner[1] < 0.3

@@ -11,21 +11,17 @@ from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 import av
-import numpy as np
 
 from pipeline.untrusted.child import Arrays, Reply, Values
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.films import MAX_PIXELS, opened_film
-from stages.views.orientation import orientation_from_rotation
+from stages.views.reading.shown import shown, shown_size, turn_of
 from stages.views.sampling import uniform_indices
 
 #: Readers of films that hold an index of their frames.
 WITH_INDEX = ("mov", "matroska")
 #: Pixels of the long side of a glance.
 GLANCE = 64
-#: Pixels of a film are this much wider than high, or higher than wide, at most: 4/3 on tapes and
-#: cards of camcorders, 2.9 where half the columns were left out. More is damage.
-WIDEST_PIXEL = 4.0
 #: Frames to glance at for each that is wanted, at most, and key frames, at least.
 GLANCES, FEWEST_KEYS = 8, 0.75
 
@@ -141,20 +137,11 @@ def _opened(container: Any, threads: int) -> Any:
     return stream
 
 
-def _shown_size(stream: Any, frame: Any) -> tuple[int, int]:
-    """(width, height) at which players show a frame: with square pixels, none of them lost."""
-    aspect = float(stream.sample_aspect_ratio or 1)
-    if not 1 / WIDEST_PIXEL <= aspect <= WIDEST_PIXEL:
-        aspect = 1.0
-    return round(frame.width * max(aspect, 1)), round(frame.height / min(aspect, 1))
-
-
 def _reply(index: int, frame: Any, start: float, size: tuple[int, int]) -> Reply:
     """Frame number `index`, at this size, of a film whose first is shown at `start` seconds."""
     seconds = frame.time - start if frame.time is not None else index
-    turn = orientation_from_rotation(frame.rotation)
-    values = {"index": index, "orientation": turn, "seconds": round(float(seconds), 6)}
-    return values, [np.ascontiguousarray(frame.reformat(*size, "rgb24").to_ndarray())]
+    values = {"index": index, "orientation": turn_of(frame), "seconds": round(float(seconds), 6)}
+    return values, [shown(frame, size)]
 
 
 def _glance(
@@ -219,7 +206,7 @@ def _decode_from_keys(
                 frame, at = next(frames, None), at + 1
                 if frame is None or frame.is_corrupt or frame.pts != contents.shown[at]:
                     return False
-                size = _shown_size(stream, frame)
+                size = shown_size(stream, frame)
                 check_size(*size)
                 if at == 0:
                     yield {"size": [*size]}, []
@@ -238,7 +225,7 @@ def _decode(
     with opened_film(file) as container:
         stream = _opened(container, threads)
         for index, frame in enumerate(container.decode(stream)):
-            size = _shown_size(stream, frame)
+            size = shown_size(stream, frame)
             check_size(*size)
             if index == 0:
                 yield {"size": [*size]}, []
