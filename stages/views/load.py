@@ -112,12 +112,14 @@ def load_photos(
 def load_video(
     label: str, path: Path, mask: Path | None, wanted: Wanted, long_side: int, min_side: int,
     cut_border: bool = True, threads: int = 1, progress: Progress = lambda done, total: None,
+    warn: Callable[[str], None] = lambda message: None,
 ) -> list[Loaded]:  # fmt: skip
     """Load evenly chosen frames of a video; a mask serves for all of them.
 
     Args:
         cut_border: cut off what most frames have around them, such as the bars beside a film that
             was taken upright.
+        warn: called with what is wrong with the film, if it can be used all the same.
 
     Raises:
         RequestError: the video or the mask can't be used.
@@ -129,7 +131,9 @@ def load_video(
         return frame.index, frame.seconds, picture, within
 
     def frames_of(file: BinaryIO, of: Wanted) -> list[tuple[int, float, Prepared, list[Box]]]:
-        return map_frames(file, prepared, of, threads, progress, check)
+        return map_frames(
+            file, prepared, of, threads, progress, check, lambda what: warn(f"{label} {what}")
+        )
 
     box: Box | None = None
     try:

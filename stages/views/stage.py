@@ -116,13 +116,14 @@ class ViewsStage(Stage):
         from_video = is_video(PurePath(first))
         wanted = (config.frames or FRAMES_OF_A_VIDEO) if from_video else len(files)
         frames = Wanted(wanted, config.sampling == "difference", _frame_numbers(first, config))
+        said: dict[str, None] = {}  # each once, however often the film is read
 
         def load(long_side: int) -> list[Loaded]:
             size = {"long_side": long_side, "min_side": config.min_side}
             if from_video:
                 return load_video(
                     first, files[first], masks.get(first), frames, cut_border=config.cut_sheets,
-                    threads=context.threads, progress=progress, **size,
+                    threads=context.threads, progress=progress, warn=said.setdefault, **size,
                 )  # fmt: skip
             return load_photos(
                 files, masks, cut_sheets=config.cut_sheets,
@@ -139,6 +140,8 @@ class ViewsStage(Stage):
                 everything = load(best)
         else:
             everything = load(config.long_side)
+        for message in said:
+            context.warn(message)
         _tell_of_sheets(files, [item.source_name for item in everything], context.warn)
         held_names = held_labels([item.source_name for item in everything], config.held_out)
         loaded = [item for item in everything if item.source_name not in held_names]

@@ -31,14 +31,14 @@ def level(index: int) -> int:
 
 def film(
     path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96),
-    coded: str = "", bars: int = 0, pixel: Fraction | None = None,
+    coded: str = "", bars: int = 0, pixel: Fraction | None = None, **container_options: str,
 ) -> Path:  # fmt: skip
     """Write a film whose frame n is of brightness `level(n)`, red at the top left.
 
     `coded` are options of x264, `bars` the widths of black ones on the left and right, `pixel` is
     the width of a pixel over its height.
     """
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=container_options) as container:
         stream: Any = container.add_stream(codec, rate=Fraction(25))
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         if pixel is not None:
@@ -282,3 +282,15 @@ def test_a_film_that_breaks_off_gives_what_it_has(tmp_path: Path) -> None:
     assert len(found) == 3
     assert found[0] == 0
     assert 10 < found[-1] < 29
+
+
+def test_a_film_whose_index_comes_first_may_break_off(tmp_path: Path) -> None:
+    path = film(tmp_path / "x.mp4", coded="keyint=5", bars=8, movflags="faststart")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    views, context = run_stage(tmp_path / "out", path)
+    assert 15 < len(views) < 28
+    assert [view.source_name for view in views.views][:2] == ["x.mp4#0", "x.mp4#1"]
+    assert [message.split(":")[0] for message in context.warnings] == [
+        "x.mp4 breaks off", "x.mp4 is damaged",
+    ]  # fmt: skip

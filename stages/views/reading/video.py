@@ -64,6 +64,7 @@ def map_frames(
     threads: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
     check_size: Callable[[int, int], None] = lambda width, height: None,
+    warn: Callable[[str], None] = lambda message: None,
 ) -> list[Used]:
     """What `use` makes of frames, evenly chosen from the first to the last, one at a time.
 
@@ -76,6 +77,7 @@ def map_frames(
         threads: for decoding; does not change the frames.
         progress: called with (frames decoded, frames in all).
         check_size: as in `decode_photo`.
+        warn: called with what is wrong with it, as the end of a sentence.
 
     Raises:
         UnusableFile: it can't be opened or has no frames.
@@ -95,6 +97,10 @@ def map_frames(
                 check_size(*reply["size"])
             elif "counted" in reply:
                 continue
+            elif "there" in reply:
+                warn(f"breaks off: of its {reply['of']} frames {reply['there']} are there.")
+            elif "left_out" in reply:
+                warn("is damaged: frames that can't be decoded are left out.")
             elif "again" in reply:
                 made.clear()
             elif "done" in reply:

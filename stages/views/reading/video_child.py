@@ -94,6 +94,7 @@ def _indices(values: Values, count: int) -> list[int]:
 def _contents(file: BinaryIO) -> Generator[Reply, None, _Contents]:
     """What is in the film; says now and then that it is at work."""
     packets: list[tuple[int | None, bool]] = []
+    number = 0  # the last packet holds nothing
     with opened_film(file) as container:
         stream = _video(container)
         check_size(stream.codec_context.width, stream.codec_context.height)
@@ -103,6 +104,8 @@ def _contents(file: BinaryIO) -> Generator[Reply, None, _Contents]:
             if number % 500 == 0:
                 yield {"counted": len(packets)}, []
         known = container.format.name.startswith(WITH_INDEX)
+        if number < stream.frames and container.format.name.startswith("mov"):
+            yield {"there": number, "of": stream.frames}, []
     timed = sorted((time, key) for time, key in packets if time is not None)
     shown, keys = [time for time, _ in timed], [n for n, (_, key) in enumerate(timed) if key]
     if not known or keys[:1] != [0] or len(set(shown)) < len(packets):
@@ -182,6 +185,26 @@ def _glance(
                 yield {"counted": number}, []
 
 
+def _frames(container: Any, stream: Any) -> Iterator[Any]:
+    """Frames in the order in which they are shown; None for packets that are damaged.
+
+    Raises:
+        av.error.InvalidDataError: all are.
+    """
+    problem, count = None, 0
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.error.InvalidDataError as error:
+            problem = problem or error
+            yield None
+            continue
+        count += len(frames)
+        yield from frames
+    if problem is not None and count == 0:
+        raise problem
+
+
 def _decode_from_keys(
     file: BinaryIO, indices: list[int], contents: _Contents, threads: int
 ) -> Generator[Reply, None, bool]:
@@ -193,7 +216,7 @@ def _decode_from_keys(
     keys, at, start = contents.keys, -1, 0.0
     with opened_film(file) as container:
         stream = _opened(container, threads)
-        frames = container.decode(stream)
+        frames = _frames(container, stream)
         for index in indices:
             key = keys[bisect_right(keys, index) - 1]
             if key > at + 1:
@@ -201,7 +224,7 @@ def _decode_from_keys(
                     container.seek(contents.shown[key], stream=stream)
                 except av.error.FFmpegError:
                     return False
-                frames, at = container.decode(stream), key - 1
+                frames, at = _frames(container, stream), key - 1
             while at < index:
                 frame, at = next(frames, None), at + 1
                 if frame is None or frame.is_corrupt or frame.pts != contents.shown[at]:
@@ -224,7 +247,11 @@ def _decode(
     chosen, start, index = set(indices), 0.0, -1
     with opened_film(file) as container:
         stream = _opened(container, threads)
-        for index, frame in enumerate(container.decode(stream)):
+        for frame in _frames(container, stream):
+            if frame is None:
+                yield {"left_out": True}, []
+                continue
+            index += 1
             size = shown_size(stream, frame)
             check_size(*size)
             if index == 0:
