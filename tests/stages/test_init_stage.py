@@ -1,6 +1,7 @@
 """The stage as a whole: what it says when photographs don't do, and what it gives when they do."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,8 @@ from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
 from pipeline.geometry.rigid import angle_between
 from pipeline.stage import LocalContext
-from stages.init.sfm.diagnosis import least_views, standing_still
+from stages.init.sfm.diagnosis import least_views
+from stages.init.sfm.matching.two_view import TwoView
 from stages.init.sfm.reconstruct import Evidence, group_lenses
 from stages.init.stage import InitConfig, InitStage
 
@@ -64,7 +66,8 @@ def test_one_photograph_is_not_enough(tmp_path):
         run(tmp_path, [texture(0)])
 
 
-def test_identical_photographs_show_no_depth(tmp_path):
+def test_identical_photographs_show_no_depth(tmp_path, monkeypatch):
+    monkeypatch.delattr("stages.init.sfm.solver.map_views")  # nobody looks for cameras
     with pytest.raises(ReconstructionError, match="did not move"):
         run(tmp_path, [texture(0)] * 3)
 
@@ -103,7 +106,14 @@ def test_views_needed():
 
 
 def test_standing_still_needs_all_views():
-    assert standing_still(Evidence([100] * 3, {(0, 1): 9}, {(0, 1): 0.1}), 3) is None
+    edge = TwoView(30, np.arange(30), 1.0, np.eye(3, 4))
+    one_pair = Evidence([100] * 3, {(0, 1): 9}, {(0, 1): 0.1}, {(0, 1): edge})
+    assert not one_pair.is_still()
+    both = replace(
+        one_pair, displacement={(0, 1): 0.1, (1, 2): 0.2}, edges={(0, 1): edge, (1, 2): edge}
+    )
+    assert both.is_still()
+    assert not replace(both, displacement={(0, 1): 0.1, (1, 2): 2.0}).is_still()
 
 
 def test_views_of_one_size_and_focal_share_a_lens():

@@ -138,9 +138,11 @@ def _failure(
             "spots): the photograph is blurred, too dark, too bright, or its mask covers it. "
             "Leave it out or take it again."
         )
-    still = standing_still(evidence, len(names))
-    if still:
-        return still
+    if evidence.is_still():
+        return (
+            "The camera did not move between the photographs: they are the same, or nearly, "
+            f"so that there is no depth to see. {HOW_TO_SHOOT}"
+        )
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
@@ -161,20 +163,6 @@ def _failure(
             f"{_listed([names[view] for view in unplaced])}. {reasons} "
             f"{_advice(attempt, names, bad)}"
         ).rstrip()
-    return None
-
-
-def standing_still(evidence: Evidence, count: int) -> str | None:
-    """The diagnosis if no pair of photographs shows any movement, else None."""
-    strong = [pair for pair, edge in evidence.edges.items() if edge.evidence >= 25]
-    if not strong:
-        return None
-    linked = {view for pair in strong for view in pair}
-    if len(linked) == count and all(evidence.displacement[pair] < 1.5 for pair in strong):
-        return (
-            "The camera did not move between the photographs: they are the same, or nearly, "
-            f"so that there is no depth to see. {HOW_TO_SHOOT}"
-        )
     return None
 
 

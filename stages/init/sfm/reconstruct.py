@@ -51,6 +51,8 @@ from stages.init.sfm.solver import Progress, Solver, known_focal, unknown_focal
 REFINEMENT = RefinementOptions()
 #: How many pairs are asked whether there is any parallax.
 PAIRS_CHECKED_FOR_DEPTH = 4
+#: Pixels below which nothing moved between two photographs, and evidence that makes it certain.
+STILL, CERTAIN = 1.5, 25
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,18 @@ class Evidence:
     linked: tuple[Pair, ...] = ()
     flat: float = 0.0
     correspondences: Mapping[Pair, Correspondences] = field(default_factory=dict)
+
+    def is_still(self, pairs: Iterable[Pair] | None = None) -> bool:
+        """Does none of these pairs, all that are certain by default, show any movement?
+
+        False where that leaves views out.
+        """
+        certain = [pair for pair, edge in self.edges.items() if edge.evidence >= CERTAIN]
+        linked = {view for pair in certain for view in pair}
+        asked = certain if pairs is None else pairs
+        return len(linked) == len(self.keypoints) > 0 and all(
+            self.displacement[pair] < STILL for pair in asked
+        )
 
 
 @dataclass(frozen=True)
@@ -181,7 +195,11 @@ def reconstruct(
         keypoints=[len(np.unique(feature.points)) for feature in features],
         matches={pair: len(found) for pair, found in correspondences.items()},
         displacement={pair: _displacement(found) for pair, found in correspondences.items()},
+        correspondences=correspondences,
     )
+    unmoved = replace(evidence, edges=solver.first_edges(), linked=tuple(solver.links()))
+    if unmoved.is_still(correspondences):  # whatever the focal length, and however long one looks
+        return Attempt(None, unmoved, all(lens.focal for lens in lenses), focal_determined=False)
     free = options.refine_focal == "always" or (
         options.refine_focal == "auto"
         and not focal_given
@@ -213,7 +231,6 @@ def reconstruct(
             edges=edges,
             linked=tuple(solver.believed(edges)),
             flat=min(shares, default=0.0),
-            correspondences=correspondences,
         ),
         focal_known=known,
         focal_determined=determined,

@@ -100,8 +100,11 @@ class Solver:
 
     def links(self) -> list[Pair]:
         """The pairs that can be believed, at the focal lengths known or tried first."""
-        focals = [lens.focal or STARTS[0] * lens.long_side for lens in self.given.lenses]
-        return self.believed(self._edges(focals))
+        return self.believed(self.first_edges())
+
+    def first_edges(self) -> dict[Pair, TwoView]:
+        """The two-view geometries at the focal lengths known or tried first."""
+        return self._edges([lens.focal or STARTS[0] * lens.long_side for lens in self.given.lenses])
 
     def believed(self, edges: dict[Pair, TwoView]) -> list[Pair]:
         """Those of the pairs that can be believed."""
