@@ -153,7 +153,8 @@ def _finish_surface(
     if mesh is not None:
         seen = sights(mesh, scene.cameras, scene.masks)
         if mouth is not None:
-            jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras))
+            up = None if mouth.axes is None else mouth.axes[1]
+            jaws = jaws_of(mesh, seen, crown_maps(mouth.dentitions, scene.cameras), up)
         if jaws:
             mesh = even_border(mesh, jaws["upper"])
             seen = sights(mesh, scene.cameras, scene.masks)

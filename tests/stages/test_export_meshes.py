@@ -158,6 +158,27 @@ def test_gums_go_with_the_nearest_crowns() -> None:
     assert not jaws_at(places, mesh, {}).any()
 
 
+def test_the_underside_of_upper_crowns_is_the_upper_jaws() -> None:
+    """Where they bite in front; as much of it was called the lower jaw's, and stood out from it."""
+    mesh = sheet(
+        41, 61,
+        lambda u, v: (
+            2 * u - 1,
+            np.interp(v, [0, 0.4, 0.6, 1], [-1, -0.1, -0.08, 1]),
+            np.interp(v, [0, 0.4, 0.6, 1], [-0.3, -0.3, 0, 0]),
+        ),
+        lambda u, v: (u, v, 0.5 + 0 * u),
+    )  # fmt: skip
+    seen = sights(mesh, [camera(0.0)], {"000": np.ones((SIZE, SIZE), bool)})
+    crowns = np.zeros((SIZE, SIZE), np.int8)
+    crowns[25:42], crowns[50:60] = 1, -1
+    middle = mesh.vertices[mesh.faces].mean(1)
+    ledge = (middle[:, 2] > -0.28) & (middle[:, 2] < -0.02)
+    assert jaws_of(mesh, seen, [crowns])["lower"][ledge].mean() > 0.3
+    jaws = jaws_of(mesh, seen, [crowns], np.array([0.0, -1, 0]))
+    assert jaws["upper"][ledge].all() and jaws["lower"][middle[:, 1] > 0].all()
+
+
 def test_points_follow_the_bend_of_the_fit() -> None:
     """The points of a ball that the fit made 3 % larger."""
     cameras = scene.ball_cameras()

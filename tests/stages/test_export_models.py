@@ -192,6 +192,23 @@ def test_a_jaw_that_was_seen_from_behind_as_well_stays_as_it_is() -> None:
     assert not inside(model, around(13, angles, -0.5)).any()
 
 
+def test_gum_that_curls_in_at_its_border_does_not_cut_the_base() -> None:
+    def shape(u, v):  # type: ignore[no-untyped-def]
+        angle = np.pi * (0.15 + 0.7 * u)
+        radius = np.interp(v, [0, 0.8, 1], [12, 12, 10.5])
+        return (
+            radius * np.cos(angle),
+            np.interp(v, [0, 0.8, 1], [0, 7, 7.3]),
+            radius * np.sin(angle),
+        )
+
+    mesh = facing_out(sheet(120, 50, shape, lambda u, v: (u, v, v)))
+    model = closed(mesh, height=4.0, depth=4.0, voxel=0.3)
+    assert model is not None and is_closed(model)
+    angles = np.linspace(0.25 * np.pi, 0.75 * np.pi, 30)
+    assert all(inside(model, around(11.2, angles, y)).all() for y in (5.0, 8.0, 10.0))
+
+
 def test_of_a_surface_that_only_looks_down_there_is_no_model() -> None:
     ledge = sheet(10, 10, lambda u, v: (8 * u, 0 * u, 8 * v), lambda u, v: (u, v, v))
     if vertex_normals(ledge)[0, 1] < 0:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, filled
-from stages.export.mesh.surface import Mesh
+from stages.export.mesh.surface import Mesh, face_normals
 from stages.export.mesh.texture.charts import charts, neighbours
 from stages.export.mesh.texture.sight import Sight
 
@@ -30,6 +30,9 @@ EVENINGS = 6
 #: What lies farther from the mesh than this share of its diagonal is of no jaw.
 OFF = 0.04
 NEITHER, UPPER, LOWER = 0, 1, 2
+#: Faces that look so far down (cosine) at the upper border of the lower jaw are the underside of
+#: upper crowns, which bite in front; no crown leans out by 49 degrees. The upper jaw's alike.
+LEDGE = 0.75
 #: A piece smaller than this share of its jaw's largest that touches the other jaw belongs to that.
 SMALLEST_PIECE = 0.02
 
@@ -59,16 +62,22 @@ def crown_maps(
     return maps
 
 
-def jaws_of(mesh: Mesh, seen: Sequence[Sight], maps: Sequence[Signs | None]) -> Mapping[Jaw, Bools]:
+def jaws_of(
+    mesh: Mesh,
+    seen: Sequence[Sight],
+    maps: Sequence[Signs | None],
+    up: npt.NDArray[np.floating] | None = None,
+) -> Mapping[Jaw, Bools]:
     """The faces of each jaw.
 
     The photographs vote on the vertices that they show inside crowns. Gums and all else go with the
-    crown that is nearest along the surface.
+    crown that is nearest along the surface, and undersides of crowns with these.
 
     Args:
         mesh: to divide.
         seen: as each of K cameras sees it.
         maps: K times where crowns are, see `crown_maps`.
+        up: [3] unit, from the lower jaw to the upper one; None: not known.
 
     Returns:
         Jaw -> [F] bool, both jaws; nothing, if the crowns of a jaw are hardly seen.
@@ -89,6 +98,8 @@ def jaws_of(mesh: Mesh, seen: Sequence[Sight], maps: Sequence[Signs | None]) -> 
         sign = (sign + ties @ sign) * shares
     upper = sign[mesh.faces].sum(1) > 0
     pairs = neighbours(mesh.faces)
+    if up is not None:
+        upper = upper ^ _ledges(mesh, upper, pairs, np.asarray(up, np.float64))
     piece = charts(upper.astype(np.int64), pairs)
     sizes = np.bincount(piece)
     largest = {side: sizes[piece[upper == side]].max(initial=0) for side in (True, False)}
@@ -126,6 +137,24 @@ def jaws_at(
     near = np.isfinite(away)
     found[finite[near]] = np.where(votes[known[nearest[near]]] > 0, UPPER, LOWER)
     return found
+
+
+def _ledges(
+    mesh: Mesh, upper: Bools, pairs: npt.NDArray[np.int64], up: npt.NDArray[np.float64]
+) -> Bools:
+    """[F] faces that join a crown to what the other jaw has in front of it, and look away from it.
+
+    Args:
+        upper: [F] whose jaw each is so far.
+        pairs: [E, 2] neighbouring faces.
+    """
+    normals = face_normals(mesh)
+    away = np.where(upper, 1, -1) * (normals @ up) > LEDGE * np.linalg.norm(normals, axis=1)
+    piece = charts(np.where(away, 1 + upper, 0), pairs)
+    meeting = pairs[upper[pairs[:, 0]] != upper[pairs[:, 1]]]
+    touching = np.zeros(piece.max(initial=0) + 1, bool)
+    touching[piece[meeting.ravel()]] = True
+    return np.asarray(away & touching[piece])
 
 
 def _edges(mesh: Mesh) -> csr_matrix:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from stages.export.mesh.field import BLOCK, Field, around_blocks
+from stages.export.mesh.jaws import LEDGE
 from stages.export.mesh.nets import zero_surface
 from stages.export.mesh.plan import Plan, plan_behind
 from stages.export.mesh.rims import even_rims, rim_edges
@@ -27,9 +28,6 @@ Ints = npt.NDArray[np.int64]
 
 #: Grid points of a model, at most; beyond, voxels get larger.
 MOST_POINTS = 8_000_000
-#: Faces that look so far away from the other jaw (cosine), from a rim on, are ledges: they join a
-#: crown to what bites in front of it. No photograph shows them; no crown leans out by 49 degrees.
-LEDGE = 0.75
 #: Parts of a jaw smaller than this share of its largest are not made solid.
 SMALLEST_PART = 0.05
 #: A closest point with this share of border vertices lies on the border of the surface.
@@ -217,7 +215,8 @@ def closed(mesh: Mesh, height: float, depth: float, voxel: float) -> Mesh | None
 
 
 def _without_ledges(mesh: Mesh) -> Mesh:
-    """The mesh without the faces that look away from the other jaw, from its rims on."""
+    """The mesh without the faces that look away from the other jaw, from its rims on: in front of
+    these there would be no base."""
     normals = face_normals(mesh)
     away = normals[:, 1] > LEDGE * np.linalg.norm(normals, axis=1)
     touched = border_vertices(mesh)
