@@ -53,6 +53,10 @@ class Scene:
     orbit: Orbit
     frame_from_world: npt.NDArray[np.float64]
 
+    def voxel(self, resolution: int) -> float:
+        """Edge of a voxel, if so many go across what a photograph shows."""
+        return 2 * self.orbit.radius / resolution
+
     def picture(self, camera: Camera) -> Pixels:
         """[H, W, 3] uint8 as a camera sees the Gaussians, black behind."""
         return to_uint8(self.painter(camera).image)

@@ -147,7 +147,11 @@ def _finish_surface(
     from stages.export.mesh.texture.sight import sights
 
     config: ExportConfig = context.config
-    mesh = clean_mesh(raw, config.mesh_faces) if raw is not None else None
+    mesh = (
+        clean_mesh(raw, config.mesh_faces, scene.voxel(config.mesh_resolution))
+        if raw is not None
+        else None
+    )
     seen: Sequence[Sight] = ()
     jaws: Mapping[Jaw, npt.NDArray[np.bool_]] = {}
     if mesh is not None:

@@ -18,8 +18,9 @@ from pipeline.artifacts.teeth import Teeth
 from pipeline.stage import LocalContext
 from stages.dentition.crowns import Outline, dentition_of
 from stages.export.mesh.bend import bent
-from stages.export.mesh.building import clean_mesh
+from stages.export.mesh.building import clean_mesh, made_of
 from stages.export.mesh.jaws import LOWER, NEITHER, UPPER, jaws_at, jaws_of
+from stages.export.mesh.rims import without_fringes
 from stages.export.mesh.surface import (
     Mesh,
     face_normals,
@@ -321,13 +322,47 @@ def test_in_our_own_frame_the_units_are_our_own_though_millimetres_are_known(
         assert "own units" in text and "no scale is known" not in text
 
 
+def test_what_guessed_points_made_beside_trusted_ones_is_told() -> None:
+    """A wall whose end is guessed to curl out; between trusted points guessed ones may help."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 10, 0.5), np.arange(0, 6, 0.5)))
+    start = scene.ball_points()[np.arange(len(x))]
+    wall = np.stack([x, y, 0 * x], 1)
+    trusted = replace(
+        start, positions=wall.astype(np.float32), normals=np.float32([[0, 0, -1]]).repeat(len(x), 0)
+    )
+    curl = np.stack([np.full(12, 9.3), np.arange(0, 6, 0.5), np.full(12, -0.9)], 1)
+    between = np.float64([[3.25, 3.25, 0.05], [6.25, 2.25, 0]])
+    guessed = np.concatenate([curl, between]).astype(np.float32)
+    vertices = np.concatenate([curl + 0.05, between + 0.02, wall + 0.03])
+    made = made_of(guessed, vertices, trusted, 0.2)
+    assert made[:12].all() and not made[12:].any()
+    assert not made_of(guessed[:0], vertices, trusted, 0.2).any()
+
+
+def test_tatters_at_the_rims_are_cut_off() -> None:
+    """Tongues of .6 at one side of a sheet, a bridge as narrow beside a hole; the rest stays."""
+    whole = sheet(121, 81, lambda u, v: (12 * u, 8 * v, 0 * u), lambda u, v: (u, v, 0 * u))
+    x, y, _ = whole.vertices.T
+    tongue = (x > 9.95) & (np.mod(y, 2) > 0.65)
+    hole = (x > 4) & (x < 6) & (y > 0.65) & (y < 3)
+    mesh = without_fringes(keep_vertices(whole, ~tongue & ~hole), 0.5)
+    x, y, _ = mesh.vertices.T
+    assert x.max() < 10.3, "tongues"
+    assert not ((x > 4.6) & (x < 5.4) & (y < 1)).any(), "a bridge"
+    for corner in ((0, 0), (0, 8), (9.9, 8)):
+        assert np.hypot(x - corner[0], y - corner[1]).min() < 0.5
+    assert len(mesh) > 0.9 * len(keep_vertices(whole, ~hole & (whole.vertices[:, 0] < 9.95)))
+    assert without_fringes(mesh, 9.0) is mesh, "nothing is wider than that"
+    assert without_fringes(mesh, 0.1) is mesh, "its edges are too long to tell"
+
+
 @pytest.mark.parametrize("most", [100, 300, 1000])
 def test_a_mesh_has_no_more_triangles_than_asked_whatever_its_rims_have(most: int) -> None:
     wave = sheet(300, 60, lambda u, v: (60 * u, 12 * v, np.sin(20 * u)), lambda u, v: (u, v, 0 * u))
     holes = np.stack(np.meshgrid(np.arange(4, 60, 8), [3, 9], [0]), -1).reshape(-1, 3)
     away, _ = cKDTree(holes).query(wave.vertices * (1, 1, 0))
     ragged = keep_vertices(wave, away > 1.2)
-    mesh = clean_mesh(ragged, most)
+    mesh = clean_mesh(ragged, most, 0.02)
     assert mesh is not None and 0.9 * most < len(mesh) <= most
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     spots, _ = trimesh.sample.sample_surface(solid, 20_000, seed=0)

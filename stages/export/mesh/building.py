@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
@@ -14,12 +15,13 @@ from pipeline.artifacts.views import to_uint8
 from stages.export.mesh.bend import bent
 from stages.export.mesh.field import TRUNCATION, colors_of, fuse
 from stages.export.mesh.nets import zero_surface
-from stages.export.mesh.rims import even_rims, rim_edges
+from stages.export.mesh.rims import even_rims, rim_edges, without_fringes
 from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,
     drop_small_parts,
     keep_near,
+    keep_vertices,
     poisson,
     repair,
     spacing,
@@ -29,6 +31,9 @@ from stages.export.mesh.surface import (
 if TYPE_CHECKING:
     from stages.export.scene import Scene
 
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
 Progress = Callable[..., None]
 
 #: A mesh with fewer triangles than this is no mesh of anything.
@@ -36,6 +41,11 @@ FEWEST_FACES = 100
 #: The mesh needs a trusted point within this many of their spacings, or this many voxels.
 SUPPORT_REACH = 4.0
 SUPPORT_VOXELS = 6.0
+#: Where a point that is not trusted is nearer, the mesh may be so many voxels off the planes of
+#: trusted points around, of so many of them off the nearest.
+OFF_PLANE, PLANES = 2.0, 8
+#: What is narrower at the rims than twice so many voxels is cut off: tatters of where points end.
+FRINGE = 4.0
 #: Connected parts of the mesh smaller than this share of the largest are dropped.
 SMALLEST_PART = 0.02
 #: Holes of up to this many edges are closed.
@@ -67,12 +77,12 @@ def raw_surface(
     Returns:
         The surface, or None if too little is trusted.
     """
-    voxel = 2 * scene.orbit.radius / resolution
-    trusted: Points = scene.points[scene.points.confidence > confidence]
-    if len(trusted) < FEWEST_FACES:
+    voxel = scene.voxel(resolution)
+    start: Points = scene.points[scene.points.confidence > confidence]
+    if len(start) < FEWEST_FACES:
         return None
     trusted = bent(
-        trusted, scene.cameras, [_trusted(scene, k, np.inf) for k in range(len(scene.seen))]
+        start, scene.cameras, [_trusted(scene, k, np.inf) for k in range(len(scene.seen))]
     )
     reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * spacing(trusted.positions))
     if method == "tsdf":
@@ -83,20 +93,47 @@ def raw_surface(
             return None
         octree = int(np.clip(np.ceil(np.log2(resolution)), 5, DEEPEST_OCTREE))
         surface = poisson(oriented.positions, oriented.normals, oriented.colors, octree)
-    return keep_near(surface, trusted.positions, reach)
+    surface = keep_near(surface, trusted.positions, reach)
+    guessed = scene.points[scene.points.confidence <= confidence].positions
+    return keep_vertices(surface, ~made_of(guessed, surface.vertices, start, voxel))
 
 
-def clean_mesh(surface: Mesh, most_faces: int) -> Mesh | None:
+def made_of(guessed: Floats, vertices: Array, trusted: Points, voxel: float) -> Bools:
+    """[V] which vertices of a surface points have made that are not trusted: such a one is nearer,
+    and what is trusted around lies elsewhere.
+
+    Args:
+        guessed: [N, 3] points that are not trusted.
+        vertices: [V, 3].
+        trusted: points as the fit found them; bent, those that guessed ones hide are on these.
+        voxel: world units.
+    """
+    if not len(guessed):
+        return np.zeros(len(vertices), bool)
+    near, places = cKDTree(trusted.positions).query(vertices, PLANES)
+    away = vertices[:, None] - trusted.positions[places]
+    off = np.abs((away * trusted.normals[places]).sum(-1)).min(1)
+    other, _ = cKDTree(guessed).query(vertices)
+    return np.asarray((other < near[:, 0]) & (off > OFF_PLANE * voxel))
+
+
+def clean_mesh(surface: Mesh, most_faces: int, voxel: float) -> Mesh | None:
     """A surface without loose parts and holes, of at most so many triangles, with even rims; None
     if too little is left.
 
     Rims that would take most of the triangles are simplified with the rest, and have no steps then.
+
+    Args:
+        surface: see `raw_surface`.
+        most_faces: triangles, at most.
+        voxel: in which it was made, world units.
     """
     surface = drop_small_parts(surface, SMALLEST_PART)
     if len(surface) < FEWEST_FACES:
         return None
     rims_stay = 2 * len(rim_edges(surface.faces)) <= most_faces
-    surface = drop_small_parts(repair(surface, most_faces, LARGEST_HOLE, rims_stay), SMALLEST_PART)
+    surface = repair(surface, most_faces, LARGEST_HOLE, rims_stay)
+    surface = drop_small_parts(without_fringes(surface, FRINGE * voxel), SMALLEST_PART)
     if len(surface) < min(FEWEST_FACES, most_faces / 2):
         return None
     return even_rims(surface) if rims_stay else surface

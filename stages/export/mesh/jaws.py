@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, filled
-from stages.export.mesh.surface import Mesh, face_normals
+from stages.export.mesh.surface import Mesh, edge_lengths, face_normals
 from stages.export.mesh.texture.charts import charts, neighbours
 from stages.export.mesh.texture.sight import Sight
 
@@ -89,7 +89,7 @@ def jaws_of(
             votes[sight.seen] += crowns[row, column]
     if min((votes > 0).sum(), (votes < 0).sum()) < FEWEST_VERTICES:
         return {}
-    graph = _edges(mesh)
+    graph = edge_lengths(mesh)
     sign = _carried_on(mesh, graph, np.sign(votes))
     shares = 1 / (1 + np.diff(graph.indptr))
     ties = graph.copy()
@@ -155,18 +155,6 @@ def _ledges(
     touching = np.zeros(piece.max(initial=0) + 1, bool)
     touching[piece[meeting.ravel()]] = True
     return np.asarray(away & touching[piece])
-
-
-def _edges(mesh: Mesh) -> csr_matrix:
-    """[V, V] symmetric: the lengths of the edges."""
-    start = mesh.faces[:, [0, 1, 2, 1, 2, 0]].ravel().astype(np.int64)
-    end = mesh.faces[:, [1, 2, 0, 0, 1, 2]].ravel().astype(np.int64)
-    count = len(mesh.vertices)
-    once = np.unique(start * count + end)
-    start, end = once // count, once % count
-    lengths = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
-    lengths = np.maximum(lengths, 1e-12)  # 0 would be no edge
-    return coo_matrix((lengths, (start, end)), (count, count)).tocsr()
 
 
 def _carried_on(

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 
-from stages.export.mesh.surface import Mesh, face_normals
+from stages.export.mesh.surface import Mesh, edge_lengths, face_normals, keep_vertices
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -27,6 +28,24 @@ def even_rims(mesh: Mesh) -> Mesh:
     Nothing moves where rims meet, and no triangle is turned over.
     """
     return _evened(mesh, rim_edges(mesh.faces))
+
+
+def without_fringes(mesh: Mesh, reach: float) -> Mesh:
+    """The mesh without what is narrower than twice `reach` at its rims, as measured along edges: an
+    opening, as of a picture. One with edges too long to tell, or of nothing wider, stays."""
+    rim = np.unique(rim_edges(mesh.faces))
+    if not len(rim):
+        return mesh
+    lengths = edge_lengths(mesh)
+    edge = float(lengths.data.mean())
+    if 2 * edge > reach:
+        return mesh
+    inside = ~np.isfinite(dijkstra(lengths, indices=rim, min_only=True, limit=reach))
+    if not inside.any():
+        return mesh
+    back = reach + edge  # to the rim again, though edges lie askew
+    near = dijkstra(lengths, indices=np.flatnonzero(inside), min_only=True, limit=back)
+    return keep_vertices(mesh, np.isfinite(near))
 
 
 def even_border(mesh: Mesh, side: Bools) -> Mesh:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 
 from pipeline.errors import RequestError
@@ -113,7 +114,6 @@ def keep_vertices(mesh: Mesh, kept: npt.NDArray[np.bool_]) -> Mesh:
 
 def drop_small_parts(mesh: Mesh, least_share: float) -> Mesh:
     """Drop connected parts with fewer than `least_share` of the largest part's faces."""
-    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     if len(mesh) == 0:
@@ -211,6 +211,18 @@ def _transfer_colors(source: Mesh, vertices: Array) -> Array:
     weight = 1.0 / (distance + 0.1 * distance.mean() + 1e-12)
     weight /= weight.sum(1, keepdims=True)
     return np.asarray((weight[..., None] * source.colors[index]).sum(1))
+
+
+def edge_lengths(mesh: Mesh) -> csr_matrix:
+    """[V, V] symmetric: the lengths of the edges."""
+    start = mesh.faces[:, [0, 1, 2, 1, 2, 0]].ravel().astype(np.int64)
+    end = mesh.faces[:, [1, 2, 0, 0, 1, 2]].ravel().astype(np.int64)
+    count = len(mesh.vertices)
+    once = np.unique(start * count + end)
+    start, end = once // count, once % count
+    lengths = np.linalg.norm(mesh.vertices[start] - mesh.vertices[end], axis=1)
+    lengths = np.maximum(lengths, 1e-12)  # 0 would be no edge
+    return coo_matrix((lengths, (start, end)), (count, count)).tocsr()
 
 
 def face_normals(mesh: Mesh) -> Array:
