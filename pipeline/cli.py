@@ -334,7 +334,7 @@ def main() -> NoReturn:
 
 
 def command_line() -> int:
-    """Run the command line; every outcome has its exit status (docs/architecture.md)."""
+    """Run the command line; every outcome has its exit status (docs/first_case.md)."""
     let_streams_show_all()
     debug = "--debug" in sys.argv
     try:
