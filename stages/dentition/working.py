@@ -110,23 +110,17 @@ def outline_in_view(outline: Array, size: tuple[int, int], view: View) -> Array:
     scaled = outline * (np.array([view.width, view.height]) / np.array(size))
     if not view.lens_taken_out:
         return np.asarray(scaled, np.float64)
-    from pipeline.geometry.models.colmap import quiet_pycolmap
     from pipeline.geometry.models.known_cameras import (
-        KnownCamera,
+        lens_of,
         pinhole_camera,
         working_pixels_from_lens,
     )
 
-    model, width, height, *parameters = view.lens_taken_out.split()
-    lens = quiet_pycolmap().Camera(
-        model=model, width=int(width), height=int(height),
-        params=[float(value) for value in parameters],
-    )  # fmt: skip
-    known = KnownCamera(view.name, lens, np.eye(4))
+    known = lens_of(view, view.lens_taken_out)
     camera = pinhole_camera(view, known)
     lens_from_working = np.linalg.inv(working_pixels_from_lens(view, known, "teeth.json"))
     pixels = scaled @ lens_from_working[:2, :2].T + lens_from_working[:2, 2]
-    rays = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
+    rays = np.column_stack([known.lens.cam_from_img(pixels), np.ones(len(pixels))])
     # `pinhole_camera` turns the lens's axes to those of the upright image.
     straight, _ = camera.project(rays)
     return straight

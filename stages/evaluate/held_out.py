@@ -121,13 +121,6 @@ def common_lens(views: Sequence[View]) -> str | None:
 
 def without_lens(view: View, lens: str) -> View:
     """A photograph with the distortion of a lens (`View.lens_taken_out`) taken out of it."""
-    from pipeline.geometry.models.colmap import quiet_pycolmap
-    from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
+    from pipeline.geometry.models.known_cameras import as_pinhole, lens_of
 
-    model, width, height, *parameters = lens.split()
-    camera = quiet_pycolmap().Camera(
-        model=model, width=int(width), height=int(height),
-        params=[float(value) for value in parameters],
-    )  # fmt: skip
-    known = KnownCamera(view.name, camera, np.eye(4))
-    return as_pinhole(view, known, "evaluate.ground_truth")[0]
+    return as_pinhole(view, lens_of(view, lens), "evaluate.ground_truth")[0]

@@ -249,6 +249,16 @@ def as_pinhole(view: View, known: KnownCamera, setting: str = SETTING) -> tuple[
     return replace(straight, lens_taken_out=text), camera
 
 
+def lens_of(view: View, text: str) -> KnownCamera:
+    """The lens that `as_pinhole` has written as a text (`View.lens_taken_out`), at the origin."""
+    model, width, height, *parameters = text.split()
+    lens = quiet_pycolmap().Camera(
+        model=model, width=int(width), height=int(height),
+        params=[float(value) for value in parameters],
+    )  # fmt: skip
+    return KnownCamera(view.name, lens, np.eye(4))
+
+
 def bending(view: View, known: KnownCamera, setting: str = SETTING) -> float:
     """By how many pixels at most the distortion of a lens moves what its view shows."""
     straight = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), -1)

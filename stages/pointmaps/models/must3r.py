@@ -7,12 +7,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.artifacts.views import View
 from stages.pointmaps.interface import ModelCard, PreparedView, ViewPrediction
 from stages.pointmaps.loading import import_module, offline, required_checkpoint, to_numpy
-from stages.pointmaps.models.dust3r import as_signed_tensor
+from stages.pointmaps.models.dust3r import Dust3r, as_signed_tensor
 from stages.pointmaps.options import PointmapOptions
-from stages.pointmaps.prepare import multiple_of_patch, prepare
 
 #: Views that MUSt3R starts from together; the others follow one by one.
 _FIRST_VIEWS = 2
@@ -47,13 +45,7 @@ class Must3r:
             self._activation = model_module.get_pointmaps_activation(self._decoder, verbose=False)
         self._device = device
 
-    @staticmethod
-    def prepare(views: list[View], options: PointmapOptions) -> list[PreparedView]:
-        """Long side to `long_side`, sides cut to multiples of 16."""
-        return [
-            prepare(view, k, multiple_of_patch(view.width, view.height, options.long_side))
-            for k, view in enumerate(views)
-        ]
+    prepare = staticmethod(Dust3r.prepare)
 
     def predict_views(self, views: Sequence[PreparedView]) -> list[ViewPrediction]:
         """Points of all images in the world of the first."""

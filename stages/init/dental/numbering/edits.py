@@ -61,6 +61,15 @@ def _allowed(view: int, jaw: int, labels: Labels, fixed: Fixed) -> bool:
     )
 
 
+def _is_allowed(labelling: Labelling, fixed: Fixed) -> bool:
+    """The same of a whole labelling."""
+    return all(
+        _allowed(view, jaw, labelling.labels[number][jaw], fixed)
+        for number, view in enumerate(labelling.views)
+        for jaw in (0, 1)
+    )
+
+
 def with_row(labelling: Labelling, number: int, jaw: int, labels: Labels) -> Labelling:
     """A labelling with one row replaced, and no tooth missing that this row shows.
 
@@ -233,24 +242,15 @@ def improve(scorer: Scorer, scored: Scored, fixed: Fixed) -> tuple[Scored, list[
                 trials.append((score - now, changed))
         trials.sort(key=lambda trial: (trial[0], trial[1].labels))
         jobs = [changed for _, changed in trials[:JOINT_TRIALS]]
+        missing = missing_tooth_edits(labelling, scored.adjusted)
         jobs += [
             edit
-            for edit in plausible(
-                scorer, labelling, missing_tooth_edits(labelling, scored.adjusted), MISSING_TRIALS
-            )
-            if all(
-                _allowed(view, jaw, edit.labels[number][jaw], fixed)
-                for number, view in enumerate(edit.views)
-                for jaw in (0, 1)
-            )
+            for edit in plausible(scorer, labelling, missing, MISSING_TRIALS)
+            if _is_allowed(edit, fixed)
         ]
-        start = (scored.adjusted.unknowns, scored.adjusted.offsets)
-        solved = scorer.solve_all([(job, start) for job in jobs], SEARCH_STEPS)
-        solved.sort(key=lambda s: (s.score, s.labelling.labels))
-        again = [(s.labelling, (s.adjusted.unknowns, s.adjusted.offsets)) for s in solved[:3]]
-        finished = scorer.solve_all(list(again), FINAL_STEPS)
+        finished, rest = _solved(scorer, scored, jobs, 3)
         finished.sort(key=lambda s: (s.score, s.labelling.labels))
-        others += finished + solved[3:]
+        others += finished + rest
         if not finished or finished[0].score > scored.score - MIN_GAIN:
             break
         others.append(scored)
@@ -297,17 +297,21 @@ def solve_shifted(scorer: Scorer, best: Scored, fixed: Fixed) -> list[Scored]:
     shifted = [
         labelling
         for labelling in plausible(scorer, best.labelling, shifted_labellings(best.labelling))
-        if all(
-            _allowed(view, jaw, labelling.labels[number][jaw], fixed)
-            for number, view in enumerate(labelling.views)
-            for jaw in (0, 1)
-        )
+        if _is_allowed(labelling, fixed)
     ]
-    start = (best.adjusted.unknowns, best.adjusted.offsets)
-    solved = scorer.solve_all([(labelling, start) for labelling in shifted], SEARCH_STEPS)
+    finished, rest = _solved(scorer, best, shifted, NEAREST)
+    return finished + rest
+
+
+def _solved(
+    scorer: Scorer, near: Scored, labellings: list[Labelling], best: int
+) -> tuple[list[Scored], list[Scored]]:
+    """Labellings solved from one that is near: so many of the best to the end, and the others."""
+    start = (near.adjusted.unknowns, near.adjusted.offsets)
+    solved = scorer.solve_all([(labelling, start) for labelling in labellings], SEARCH_STEPS)
     solved.sort(key=lambda s: (s.score, s.labelling.labels))
-    again = [(s.labelling, (s.adjusted.unknowns, s.adjusted.offsets)) for s in solved[:NEAREST]]
-    return scorer.solve_all(list(again), FINAL_STEPS) + solved[NEAREST:]
+    again = [(s.labelling, (s.adjusted.unknowns, s.adjusted.offsets)) for s in solved[:best]]
+    return scorer.solve_all(list(again), FINAL_STEPS), solved[best:]
 
 
 def settle_ends(scorer: Scorer, best: Scored, fixed: Fixed) -> tuple[Scored, list[Scored]]:
