@@ -61,14 +61,12 @@ def make_photographs(folder: Path, seed: int, views: int, dentition: str) -> Non
         crown_height=float(np.exp(CROWN_HEIGHTS * form.normal())),
     )
     rng = np.random.default_rng([4, seed])
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     width, height = SIZE
     focal = 1.9 * width * float(rng.uniform(0.95, 1.1))
     reach = REACH if views == 3 else FILM_REACH
     for number, yaw in enumerate(np.linspace(-reach, reach, views)):
         turned, tilt, roll = rng.normal(size=3) * (3.0, 2.0, 3.0)
-        pose = look(float(yaw + turned), 4.0 + float(tilt), float(roll), 125.0, pivot)
+        pose = look(float(yaw + turned), 4.0 + float(tilt), float(roll), 125.0, mouth.pivot)
         camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
         role = role_at(float(yaw))
         photo = photograph(

@@ -63,15 +63,13 @@ def make_film(folder: Path, seed: int, pace: str) -> None:
     yaw = yaw + shaken(rng, 1.2)
     elevation, roll = 4 + shaken(rng, 1.5), shaken(rng, 1.5)
     aside = np.stack([shaken(rng, 0.6) for _ in range(3)], 1)
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     frames = []
     with av.open(str(folder / "film.mp4"), "w") as container:
         stream: Any = container.add_stream("libx264", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.options = {"crf": "16", "x264-params": f"keyint={RATE}:min-keyint={RATE}"}
         for k in range(COUNT):
-            view = look(yaw[k], elevation[k], roll[k], DISTANCE, pivot + aside[k])
+            view = look(yaw[k], elevation[k], roll[k], DISTANCE, mouth.pivot + aside[k])
             camera = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, view)
             shown = photograph(
                 mouth, np.random.default_rng([seed, 9]), role_at(float(yaw[k])), width=WIDTH,

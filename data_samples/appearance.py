@@ -139,6 +139,11 @@ def gum(local: Array, world: Array, noise: Noise) -> Surface:
     return Surface(color, wet, bump)
 
 
+def unit(vectors: Array) -> Array:
+    """Vectors [..., 3] at length 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
 def shade(
     surface: Surface, normals: Array, points: Array, eye: Array, light: Array, openness: Array
 ) -> Array:
@@ -154,9 +159,6 @@ def shade(
         eye, light: [3] lens and flash.
         openness: [N] share of the sky that a point sees, 0..1.
     """
-
-    def unit(vectors: Array) -> Array:
-        return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
     to_eye, to_light = unit(eye - points), light - points
     away = np.linalg.norm(to_light, axis=-1)

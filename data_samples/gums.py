@@ -14,13 +14,13 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Gum:
-    """A sheet of gum.
+class Sheet:
+    """A grid of soft tissue.
 
     Attributes:
-        vertices: [N, 3] in the world.
-        local: [N, 3] arc length along the arch, distance from the occlusal plane, and distance
-            from the gum's edge (negative under the teeth), mm.
+        vertices: [N, 3] in the world, mm.
+        local: [N, 3] arc length along the arch, distance from the occlusal plane, distance from the
+            gum's edge (negative under the teeth), mm.
         triangles: [M, 3].
     """
 
@@ -29,8 +29,19 @@ class Gum:
     triangles: npt.NDArray[np.int32]
 
 
+def grid_sheet(vertices: Array, local: Array, flip: bool = False) -> Sheet:
+    """Triangulate a grid [R, C, 3]; `flip` turns the faces over."""
+    rows, columns = vertices.shape[:2]
+    i, j = np.mgrid[: rows - 1, : columns - 1]
+    a = i * columns + j
+    b, c, d = a + 1, a + columns, a + columns + 1
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)]).reshape(-1, 3)
+    faces = faces[:, ::-1] if flip else faces
+    return Sheet(vertices.reshape(-1, 3), local.reshape(-1, 3), faces.astype(np.int32))
+
+
 def smoothstep(low: float, high: float, value: Array) -> Array:
-    """0 below `low`, 1 above `high`, smooth between."""
+    """0 at `low`, 1 at `high`, which may be less, smooth between."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t))
 
@@ -50,7 +61,7 @@ def tooth_relief(line: ArchLine, teeth: list[Tooth], along: Array, heights: Arra
     return np.maximum(np.where(np.isfinite(hit), 9 - hit, -4.0), -4.0)
 
 
-def grow_gum(jaw: Jaw, teeth: list[Tooth], random: np.random.Generator, step: float) -> Gum:
+def grow_gum(jaw: Jaw, teeth: list[Tooth], random: np.random.Generator, step: float) -> Sheet:
     """Drape a sheet over the roots: scalloped edge, papillae, root ridges, fold, lip."""
     line = ArchLine(jaw)
     along = np.arange(-line.reach, line.reach, step)
@@ -103,9 +114,4 @@ def grow_gum(jaw: Jaw, teeth: list[Tooth], random: np.random.Generator, step: fl
     vertices = points[:, None] + offset[..., None] * normals[:, None]
     vertices = vertices + jaw.up * reach[None, :, None] * (0, 1, 0)
     local = np.stack(np.broadcast_arrays(along[:, None], reach[None], depth), -1)
-    rows, columns = depth.shape
-    i, j = np.mgrid[: rows - 1, : columns - 1]
-    a = i * columns + j
-    b, c, d = a + 1, a + columns, a + columns + 1
-    triangles = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)]).reshape(-1, 3)
-    return Gum(vertices.reshape(-1, 3), local.reshape(-1, 3), triangles.astype(np.int32))
+    return grid_sheet(vertices, local)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from appearance import Surface
+from appearance import Surface, unit
 
 Array = npt.NDArray[np.float64]
 
@@ -54,10 +54,6 @@ def random_light(cam_from_world: Array, rng: np.random.Generator, plain: bool) -
     )  # fmt: skip
 
 
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
 def shade(
     surface: Surface, normals: Array, points: Array, eye: Array, light: Light, openness: Array
 ) -> Array:
@@ -73,9 +69,9 @@ def shade(
         light: the flashes.
         openness: [N] share of the sky that a point sees, 0..1.
     """
-    to_eye = _unit(eye - points)
-    smooth = _unit(normals * np.sign((normals * to_eye).sum(-1, keepdims=True)))
-    bumpy = _unit(smooth + surface.bump)
+    to_eye = unit(eye - points)
+    smooth = unit(normals * np.sign((normals * to_eye).sum(-1, keepdims=True)))
+    bumpy = unit(smooth + surface.bump)
     shadowed = 0.2 + 0.8 * np.clip(openness * 1.9, 0, 1)
     direct, highlight = np.zeros(len(points)), np.zeros(len(points))
     for flash in light.flashes:
@@ -86,7 +82,7 @@ def shade(
         # Tissue is translucent: light wraps about it, and half of it does not see the bumps.
         wrapped = [np.clip(((n * to_light).sum(-1) + 0.22) / 1.22, 0, 1) for n in (smooth, bumpy)]
         direct += falloff * 0.5 * (wrapped[0] + wrapped[1])
-        half = np.clip((bumpy * _unit(to_eye + to_light)).sum(-1), 0, 1)
+        half = np.clip((bumpy * unit(to_eye + to_light)).sum(-1), 0, 1)
         highlight += falloff * (1.1 * half**320 + 0.09 * half**30)
     received = light.strength * direct * shadowed + light.ambient * openness + 0.02
     # Light that bounces in crevices takes on the tissue's colour.

@@ -111,6 +111,12 @@ class Mouth:
             found[tooth.plan.fdi] = move[:3, :3] @ tooth.centre + move[:3, 3]
         return found
 
+    @property
+    def pivot(self) -> Array:
+        """[3] what cameras around the closed mouth look at, mm."""
+        centres = np.array(list(self.tooth_centres().values()))
+        return (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
+
 
 def random_mouth(rng: np.random.Generator, **overrides: Any) -> Mouth:
     """Grow a mouth.

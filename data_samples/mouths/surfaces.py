@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from appearance import Noise, Surface, linear, mix
+from gums import smoothstep
 
 from .mouth import Mouth, Tissue
 
 Array = npt.NDArray[np.float64]
-
-
-def _ramp(low: float, high: float, value: Array) -> Array:
-    t = np.clip((value - low) / (high - low), 0, 1)
-    return np.asarray(t * t * (3 - 2 * t))
 
 
 def enamel(mouth: Mouth, local: Array, tooth: npt.NDArray[np.int32]) -> Surface:
@@ -32,7 +28,7 @@ def enamel(mouth: Mouth, local: Array, tooth: npt.NDArray[np.int32]) -> Surface:
     yellow = np.clip(o.shade + o.shade_spread * own + 0.12 * canine - 0.5 * milk * o.shade, 0, 1.2)
     light = mix(linear(246, 244, 236), linear(226, 202, 154), yellow)
     neck = mix(linear(234, 224, 202), linear(196, 154, 98), yellow)
-    color = mix(light, neck, _ramp(0.3, 1.05, t))
+    color = mix(light, neck, smoothstep(0.3, 1.05, t))
     edge = np.exp(-((np.maximum(t, 0) / 0.12) ** 2)) * (0.6 + 0.25 * noise(p * (0.8, 0.2, 0.3), 1))
     color = mix(color, linear(168, 178, 182), edge * o.translucency * (1 - 0.6 * milk))
     color = (
@@ -44,11 +40,11 @@ def enamel(mouth: Mouth, local: Array, tooth: npt.NDArray[np.int32]) -> Surface:
     white = np.clip(noise.octaves(p * (0.6, 0.8, 0.6), 2, 3) - 1.3, 0, 1)
     color = mix(color, linear(248, 246, 238), 0.8 * white)
     dirt = noise.octaves(p * (0.8, 0.6, 0.8), 3, 0)
-    stain = _ramp(0, 2.0, dirt - 2.1 + 1.3 * o.stains + 0.8 * (t - 0.4))
+    stain = smoothstep(0, 2.0, dirt - 2.1 + 1.3 * o.stains + 0.8 * (t - 0.4))
     color = mix(color, linear(134, 92, 48), 0.6 * stain)
-    film = _ramp(0.0, 1.4, _ramp(0.55, 1.0, t) * o.plaque * 1.5 + 0.3 * dirt - 0.7)
+    film = smoothstep(0.0, 1.4, smoothstep(0.55, 1.0, t) * o.plaque * 1.5 + 0.3 * dirt - 0.7)
     color = mix(color, linear(206, 176, 104), 0.7 * film)
-    root = _ramp(1.05, 1.25, t)
+    root = smoothstep(1.05, 1.25, t)
     color = mix(color, linear(196, 150, 92), 0.8 * root)
     gloss = 0.85 - 0.5 * film - 0.3 * root
 
@@ -58,20 +54,25 @@ def enamel(mouth: Mouth, local: Array, tooth: npt.NDArray[np.int32]) -> Surface:
             ("metal", linear(150, 150, 152), np.full_like(t, 0.97), 2.0),
             ("gold", linear(206, 160, 74), np.full_like(t, 0.97), 2.0),
             ("grey", linear(132, 120, 104), np.full_like(t, 0.65), 0.8),
-            ("filling", linear(232, 222, 200), _ramp(0.1, 0.3, shape) * _ramp(1.1, 0.8, t), 0.7),
-            ("amalgam", linear(70, 72, 78), _ramp(0.5, 0.7, shape + 0.9 - 2.2 * t), 0.9),
+            (
+                "filling",
+                linear(232, 222, 200),
+                smoothstep(0.1, 0.3, shape) * smoothstep(1.1, 0.8, t),
+                0.7,
+            ),
+            ("amalgam", linear(70, 72, 78), smoothstep(0.5, 0.7, shape + 0.9 - 2.2 * t), 0.9),
             (
                 "mottled",
                 linear(120, 72, 34),
-                0.8 * _ramp(0.0, 1.8, dirt + 0.2) * _ramp(1, 0.6, t),
+                0.8 * smoothstep(0.0, 1.8, dirt + 0.2) * smoothstep(1, 0.6, t),
                 0.6,
             ),
         ):
             share = cover * (state == name)
             color, gloss = mix(color, target, share), gloss * (1 - share) + shine * share
-        decay = (state == "caries") * _ramp(0.9, 1.7, noise(p * 0.4, 1) + 0.7 * t)
+        decay = (state == "caries") * smoothstep(0.9, 1.7, noise(p * 0.4, 1) + 0.7 * t)
         color = mix(color, linear(112, 66, 30), 0.85 * decay)
-        color = mix(color, linear(28, 18, 12), _ramp(0.6, 1.0, decay))
+        color = mix(color, linear(28, 18, 12), smoothstep(0.6, 1.0, decay))
         gloss = gloss * (1 - 0.8 * decay)
     ripples = np.stack([noise(p * 0.7, c) for c in (0, 1, 2)], -1)
     return Surface(color, gloss, 0.035 * ripples)
@@ -93,7 +94,7 @@ def soft(mouth: Mouth, tissue: npt.NDArray[np.uint8], local: Array, world: Array
     color = color * np.exp(0.08 * noise.octaves(p * 0.22, 2, 2) + 0.05 * noise(p * 1.4, 3))[:, None]
     color = mix(color, linear(240, 190, 184), 0.5 * (1 - loose) * np.clip(noise(p * 0.5, 0), 0, 1))
     if o.pigment:
-        dark = np.exp(-(((depth - 3.0) / 2.6) ** 2)) * _ramp(
+        dark = np.exp(-(((depth - 3.0) / 2.6) ** 2)) * smoothstep(
             -0.6, 0.9, noise.octaves(p * 0.16, 2, 0)
         )
         color = mix(color, linear(74, 38, 34), 0.75 * o.pigment * dark)

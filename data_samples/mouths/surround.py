@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from appearance import linear
+from gums import smoothstep
 
 from .cameras import Camera
 from .mouth import Mouth
@@ -35,12 +36,6 @@ def clouds(shape: tuple[int, int], size: float, rng: np.random.Generator) -> Arr
     field = cv2.GaussianBlur(rng.normal(size=small), (0, 0), 1.4)
     field = cv2.resize(field / field.std(), (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
     return np.asarray(field, np.float64)
-
-
-def ramp(low: float, high: float, value: Array) -> Array:
-    """0 at `low`, 1 at `high`, smooth between."""
-    t = np.clip((value - low) / (high - low), 0, 1)
-    return np.asarray(t * t * (3 - 2 * t))
 
 
 @dataclass(frozen=True)
@@ -211,24 +206,26 @@ def _lips(
     rough = clouds(shape, 1.2 * canvas.scale, rng)
     patches = clouds(shape, 9 * canvas.scale, rng)
     around = np.arctan2(canvas.y, canvas.x)
-    wrinkles = np.sin(around * int(rng.integers(50, 90)) + 2.5 * patches) * ramp(wet, wet + 3, out)
-    wrinkles = wrinkles * ramp(lip, lip - 2, out)
+    wrinkles = np.sin(around * int(rng.integers(50, 90)) + 2.5 * patches) * smoothstep(
+        wet, wet + 3, out
+    )
+    wrinkles = wrinkles * smoothstep(lip, lip - 2, out)
     edge = out + 0.5 * patches
-    color = red + ramp(wet - 2, wet + 2, edge)[..., None] * (vermilion - red)
-    color = color + ramp(lip - 1.0, lip + 1.0, edge)[..., None] * (skin - color)
+    color = red + smoothstep(wet - 2, wet + 2, edge)[..., None] * (vermilion - red)
+    color = color + smoothstep(lip - 1.0, lip + 1.0, edge)[..., None] * (skin - color)
     grain = 0.05 + 0.05 * rng.random()
     color = color * np.exp(0.10 * patches + grain * clouds(shape, 3, rng))[..., None]
     if rng.random() < 0.25:  # stubble
-        hair = (rng.random(shape) > 0.985).astype(float) * ramp(lip + 2, lip + 8, edge)
+        hair = (rng.random(shape) > 0.985).astype(float) * smoothstep(lip + 2, lip + 8, edge)
         longer = cv2.dilate(hair, np.ones((max(2, int(canvas.scale * 0.3)), 1)))
         color = color * (1 - 0.7 * longer)[..., None]
     thick = rng.uniform(2.5, 5.5)
     height = thick * np.sin(np.clip(out / (wet + lip) * np.pi, 0, 0.62 * np.pi))
     height = height + 0.06 * wrinkles + 0.06 * rough + 0.25 * patches
-    gloss = 0.55 * ramp(wet + 2, wet - 1, edge) + 0.12
+    gloss = 0.55 * smoothstep(wet + 2, wet - 1, edge) + 0.12
     near = rng.uniform(0.55, 1.25)
     rim = near * canvas.lit(height, color, gloss)
-    alpha = ramp(-0.35, 0.35, out)
+    alpha = smoothstep(-0.35, 0.35, out)
     picture = _blend(picture, rim, alpha)
     cover = alpha
     chance = rng.random()
@@ -246,7 +243,7 @@ def _retractor(
     width = rng.uniform(2.0, 6.0) if sort != "metal" else rng.uniform(1.5, 3.0)
     start = rng.uniform(-1.5, 0.5)
     t = (out - start) / width
-    body = ramp(0.0, 0.08, t) * ramp(1.0, 0.92, t)
+    body = smoothstep(0.0, 0.08, t) * smoothstep(1.0, 0.92, t)
     height = width * 0.5 * np.sqrt(np.clip(1 - (2 * t - 1) ** 2, 0, 1))
     around = np.arctan2(canvas.y, canvas.x)
     if rng.random() < 0.6:  # it holds the corners, or one of them
@@ -257,7 +254,7 @@ def _retractor(
             if middle is not None
             else np.abs(np.angle(np.exp(2j * around))) / 2
         )
-        body = body * ramp(reach, reach - 0.15, away)
+        body = body * smoothstep(reach, reach - 0.15, away)
     if sort == "clear":
         gy, gx = np.gradient(height * canvas.scale)
         v, u = np.mgrid[: out.shape[0], : out.shape[1]].astype(np.float32)
@@ -299,7 +296,7 @@ def _capsule(
     size = radius * (1 + (taper - 1) * along / max(length, 1e-6))
     away = np.hypot(px - along * axis[0], py - along * axis[1]) / size
     blur = 0.5 / max(canvas.scale * radius, 1e-6)
-    alpha = ramp(1 + blur, 1 - blur, away)
+    alpha = smoothstep(1 + blur, 1 - blur, away)
     return alpha, size * np.sqrt(np.clip(1 - away**2, 0, 1)), along / max(length, 1e-6)
 
 

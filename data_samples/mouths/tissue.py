@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
-from gums import smoothstep
+from gums import Sheet, grid_sheet, smoothstep
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, maximum_filter
 from scipy.spatial import cKDTree
 
@@ -17,33 +15,6 @@ from .rays import cast, teeth_scene
 Array = npt.NDArray[np.float64]
 STEP = 0.3  # mm between the samples of a sheet, away from the gum's edge
 FINE = 0.2  # and along it
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A grid of soft tissue.
-
-    Attributes:
-        vertices: [N, 3] in the world, mm.
-        local: [N, 3] arc length along the arch, distance from the occlusal plane, distance from the
-            gum's edge (negative under the teeth), mm.
-        triangles: [M, 3].
-    """
-
-    vertices: Array
-    local: Array
-    triangles: npt.NDArray[np.int32]
-
-
-def grid_sheet(vertices: Array, local: Array, flip: bool = False) -> Sheet:
-    """Triangulate a grid [R, C, 3]; `flip` turns the faces over."""
-    rows, columns = vertices.shape[:2]
-    i, j = np.mgrid[: rows - 1, : columns - 1]
-    a = i * columns + j
-    b, c, d = a + 1, a + columns, a + columns + 1
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)]).reshape(-1, 3)
-    faces = faces[:, ::-1] if flip else faces
-    return Sheet(vertices.reshape(-1, 3), local.reshape(-1, 3), faces.astype(np.int32))
 
 
 def gum_edge(teeth: tuple[Tooth, ...], along: Array, options: MouthOptions) -> Array:

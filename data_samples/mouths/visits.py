@@ -122,9 +122,7 @@ def _camera(
     mouth: Mouth, yaw: float, distance: float, side: float, width: int, rng: np.random.Generator
 ) -> Camera:
     """A camera that looks at the front teeth, held by hand: a little off everywhere."""
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
-    pivot = pivot + rng.normal(size=3) * 0.8
+    pivot = mouth.pivot + rng.normal(size=3) * 0.8
     roll, elevation = float(rng.normal() * 2.5), 4.0 + float(rng.normal() * 2.0)
     view = look(yaw + float(rng.normal() * 1.5), elevation, roll, distance, pivot)
     height, focal = width * 3 // 4, side * width

@@ -29,13 +29,17 @@ def photographed(
 ) -> tuple[list[Dentition], list[Camera], list[np.ndarray]]:
     """Exact outlines with true numbers, cameras and depth, from some yaws and pitches."""
     scene = ray_scene((mouth.vertices, mouth.triangles))
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     dentitions, cameras, depths = [], [], []
     for k, (yaw, pitch) in enumerate(angles):
         focal = 1.9 * WIDTH
         true = TrueCamera(
-            WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, look(yaw, pitch, 2.0, 125.0, pivot)
+            WIDTH,
+            HEIGHT,
+            focal,
+            focal,
+            WIDTH / 2,
+            HEIGHT / 2,
+            look(yaw, pitch, 2.0, 125.0, mouth.pivot),
         )
         v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         hit = cast(scene, true.rays(np.stack([u, v], -1).reshape(-1, 2)))

@@ -136,13 +136,11 @@ def mouth_case(
     """
     rng = np.random.default_rng(seed)
     mouth = random_mouth(rng, **({**CALM, **options} if calm else options))
-    centres = np.array(list(mouth.tooth_centres().values()))
-    pivot = (centres.min(0) + centres.max(0)) / 2 * [1, 1, 0] + [0, 0, -12.0]
     photos = []
     for yaw, roll in zip(yaws, rolls, strict=True):
         role = role_at(yaw)
         focal = side * WIDTH
-        view = look(yaw, 4.0, roll, distance, pivot)
+        view = look(yaw, 4.0, roll, distance, mouth.pivot)
         camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, view)
         with in_the_dark() if dark else nullcontext():
             photos.append(
