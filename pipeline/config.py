@@ -168,6 +168,17 @@ def read_yaml(path: Path, what: str) -> Any:
         raise RequestError(f"The {what} can't be read: {error}") from error
 
 
+def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"fit": {"iterations": 5}}`` or ``{"fit.iterations": 5}`` -> the latter."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            flat |= flattened(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
+
+
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():

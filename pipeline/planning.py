@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import installed
-from pipeline.config import Config, result_fields
+from pipeline.config import Config, flattened, result_fields
 from pipeline.errors import RequestError, nearest
 from pipeline.files import canonical_json, sha256_text
 from pipeline.stage import Stage, get_stage, usable_stages
@@ -364,7 +364,7 @@ def explain(
     """Name each difference between two key materials, for people."""
     reasons = []
     stage = new["stage"]
-    before, after = _flatten(old["config"]), _flatten(new["config"])
+    before, after = flattened(old["config"]), flattened(new["config"])
     for name in sorted(before.keys() | after.keys()):
         if before.get(name) != after.get(name):
             reasons.append(f"{stage}.{name} {_show(before, name)} → {_show(after, name)}")
@@ -400,17 +400,6 @@ def _explain_sources(old: Mapping[str, str], new: Mapping[str, str]) -> list[str
             shown = ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if labels[3:] else "")
             reasons.append(f"input file {verb}: {shown}")
     return reasons
-
-
-def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        flat |= (
-            _flatten(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{name}": value}
-        )
-    return flat
 
 
 def _show(flat: Mapping[str, Any], name: str) -> str:

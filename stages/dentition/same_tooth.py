@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.teeth import Dentition, filled
+from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
-from stages.dentition.working import outline_in_view
+from stages.dentition.working import labels_in_view
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -89,7 +89,9 @@ def crown_overlaps(
         cameras, depths: of each, with z-depth [H, W], 0 where unknown.
     """
     maps = [
-        np.zeros(depth.shape, np.int32) if dentition is None else _numbered(dentition, view)
+        np.zeros(depth.shape, np.int32)
+        if dentition is None
+        else labels_in_view(dentition, view, range(1, len(dentition.all_crowns) + 1))
         for view, dentition, depth in zip(views, dentitions, depths, strict=True)
     ]
     sightings: list[Sighting] = []
@@ -149,16 +151,6 @@ def _carried(
     there = np.where(inside, depth[row * inside, column * inside], 0.0)
     seen = inside & (np.abs(there - z) < SAME_DEPTH * z)
     return seen, crowns[row * seen, column * seen]
-
-
-def _numbered(dentition: Dentition, view: View) -> npt.NDArray[np.int32]:
-    """[H, W] 1 + the index of the crown at each pixel of a view; 0: none."""
-    labels = np.zeros((view.height, view.width), np.int32)
-    for k, crown in enumerate(dentition.all_crowns):
-        if len(crown.outline) >= 3:
-            outline = outline_in_view(crown.outline, dentition.size, view)
-            labels[filled((replace(crown, outline=outline),), (view.width, view.height))] = k + 1
-    return labels
 
 
 def same_teeth(overlaps: Overlaps, rows: Sequence[int], looks: Sequence[Array]) -> list[list[int]]:

@@ -6,6 +6,7 @@ and what was found is brought back to theirs.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.teeth import Crown, Dentition, moved_polygons
+from pipeline.artifacts.teeth import Crown, Dentition, filled, moved_polygons
 from pipeline.artifacts.views import View, to_uint8
 
 Array = npt.NDArray[np.float64]
@@ -124,6 +125,19 @@ def outline_in_view(outline: Array, size: tuple[int, int], view: View) -> Array:
     # `pinhole_camera` turns the lens's axes to those of the upright image.
     straight, _ = camera.project(rays)
     return straight
+
+
+def labels_in_view(
+    dentition: Dentition, view: View, labels: Iterable[int]
+) -> npt.NDArray[np.int32]:
+    """[H, W] the label of the crown that a view shows at each pixel, of all crowns; 0: none."""
+    size = view.width, view.height
+    shown = np.zeros(size[::-1], np.int32)
+    for crown, label in zip(dentition.all_crowns, labels, strict=True):
+        if label and len(crown.outline) >= 3:
+            outline = outline_in_view(crown.outline, dentition.size, view)
+            shown[filled((replace(crown, outline=outline),), size)] = label
+    return shown
 
 
 def _shrunk(pixels: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray[Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifacts.metrics import Metrics
-from pipeline.config import load_config
+from pipeline.config import flattened, load_config
 from pipeline.errors import PipelineError, RequestError, StageError
 from pipeline.front.commands import run
 from pipeline.planning import PlannedStage
@@ -20,7 +20,7 @@ from pipeline.store import Result, read_own
 from pipeline.store.places import remove
 from pipeline.studies.benchmark.results import FINISHED
 from pipeline.studies.benchmark.splits import Split, pictures_of, split_views
-from pipeline.studies.benchmark.suite import LoadedSuite, Method, Scene, TableSpec, flat_overrides
+from pipeline.studies.benchmark.suite import LoadedSuite, Method, Scene, TableSpec
 from pipeline.workspace import make_request
 
 #: Kinds of artifact that no figure needs: stages that only make these are left out.
@@ -131,9 +131,9 @@ def _cell(
     place = f"all_{views}_views" if table.split == "all" else f"{views}_views"
     parts = [scene.name, protocol, f"{views}_views", method.name, f"seed{seed}"]
     settings: dict[str, Any] = {
-        **flat_overrides(loaded.suite.overrides),
-        **flat_overrides(scene.overrides),
-        **flat_overrides(method.overrides),
+        **flattened(loaded.suite.overrides),
+        **flattened(scene.overrides),
+        **flattened(method.overrides),
         **overrides,
     }
     settings.setdefault("report", False)  # one report of the benchmark is enough

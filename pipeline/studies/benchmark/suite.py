@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -256,14 +256,3 @@ def _check_data(loaded: LoadedSuite, given: bool) -> None:
                     f"The scene '{scene.name}' of the suite {loaded.path.name} needs {field} "
                     f"{loaded.file(path)}, which is not there. {advice}"
                 )
-
-
-def flat_overrides(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``{"fit": {"iterations": 5}}`` or ``{"fit.iterations": 5}`` -> the latter."""
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            flat |= flat_overrides(value, f"{prefix}{name}.")
-        else:
-            flat[f"{prefix}{name}"] = value
-    return flat

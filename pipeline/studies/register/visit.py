@@ -138,6 +138,7 @@ def read_visit(workspace: Path) -> Visit:
         RequestError: no run, an unfinished one, or one without teeth.
     """
     from pipeline.studies.report.reading import read_case
+    from stages.dentition.working import labels_in_view
     from stages.splatting.rendering import Painter
     from stages.views.find import MASK_PREFIX
 
@@ -166,10 +167,12 @@ def read_visit(workspace: Path) -> Visit:
             continue
         rendered = paint(camera)
         known = (rendered.alpha >= LEAST_ALPHA) & (rendered.depth > 0)
+        numbers = [crown.number for crown in dentition.all_crowns]
+        labels = labels_in_view(dentition, view, numbers).astype(np.uint8)
         pictures.append(view.image)
         looks.append(
             Look(
-                camera, cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), labels_of(dentition, view),
+                camera, cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), labels,
                 np.where(known, rendered.depth, 0).astype(np.float32), view.valid(),
             )
         )  # fmt: skip
@@ -261,20 +264,6 @@ def in_frame(camera: Camera, frame: Array) -> Camera:
     """The camera in a frame that a similarity [4, 4] leads to; depths scale with it."""
     scale = scale_of(frame)
     return move_camera(camera, (scale, frame[:3, :3] / scale, frame[:3, 3]))
-
-
-def labels_of(dentition, view) -> Labels:  # type: ignore[no-untyped-def]
-    """[H, W] FDI number of each pixel of a view, by the outlines of its numbered crowns."""
-    from pipeline.artifacts.teeth import filled
-    from stages.dentition.working import outline_in_view
-
-    labels = np.zeros((view.height, view.width), np.uint8)
-    size = view.width, view.height
-    for crown in dentition.all_crowns:
-        if crown.number and len(crown.outline) >= 3:
-            outline = outline_in_view(crown.outline, dentition.size, view)
-            labels[filled((replace(crown, outline=outline),), size)] = crown.number
-    return labels
 
 
 def teeth_points(looks: list[Look] | tuple[Look, ...]) -> dict[int, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from pipeline.geometry.graph import Pair
 from pipeline.geometry.models.colmap import quiet_pycolmap
 from stages.init.sfm.mappers import MapperOptions, global_models, incremental_models
+from stages.init.sfm.matching.features import Features
 from stages.init.sfm.matching.two_view import Correspondences, Lens, TwoView
 from stages.init.sfm.undistort import undistort_pixels
 
@@ -100,6 +102,17 @@ class MappingInput:
     positions: list[Array]
     points: list[Integers]
     correspondences: dict[Pair, Correspondences]
+
+    @classmethod
+    def of(
+        cls, lenses: list[Lens], lens_of_view: list[int], features: Sequence[Features],
+        found: Mapping[Pair, Correspondences],
+    ) -> MappingInput:  # fmt: skip
+        """Views with these features, and the matches found between them."""
+        return cls(
+            lenses, lens_of_view, [feature.positions for feature in features],
+            [feature.points for feature in features], dict(sorted(found.items())),
+        )  # fmt: skip
 
 
 def map_views(

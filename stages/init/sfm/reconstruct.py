@@ -143,13 +143,7 @@ def reconstruct(
 
     def matched(rolls: list[float]) -> tuple[list[Features], Solver]:
         def solver_of(correspondences: dict[Pair, Correspondences]) -> Solver:
-            given = MappingInput(
-                lenses=lenses,
-                lens_of_view=lens_of_view,
-                positions=[feature.positions for feature in features],
-                points=[feature.points for feature in features],
-                correspondences=dict(sorted(correspondences.items())),
-            )
+            given = MappingInput.of(lenses, lens_of_view, features, correspondences)
             return Solver(given, options, pixel, seed, threads, scratch)
 
         plain = tuple(squeeze for squeeze in options.squeezes if squeeze == 1) or options.squeezes

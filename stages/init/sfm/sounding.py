@@ -70,13 +70,7 @@ def sound(
     )  # fmt: skip
     pairs = [*overlaps(features, ordered, options)]
     found = match_pairs(features, pairs, options, pixel, threads, lambda *_: None)
-    given = MappingInput(
-        lenses=lenses,
-        lens_of_view=lens_of_view,
-        positions=[feature.positions for feature in features],
-        points=[feature.points for feature in features],
-        correspondences=dict(sorted(found.items())),
-    )
+    given = MappingInput.of(lenses, lens_of_view, features, found)
     links = Solver(given, options, pixel, seed, threads, scratch).links()
     whole = all(few is gray for (few, _), gray in zip(small, grays, strict=True))
     linked = max(Counter(groups(links, len(grays))).values())
