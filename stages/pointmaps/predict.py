@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -97,18 +98,7 @@ def predict_pointmaps(
     progress: Progress = lambda step, done, total: None,
     threads: int = 1,
 ) -> list[PointmapPair]:
-    """`iterate_pointmaps`, all at once."""
-    return list(iterate_pointmaps(views, ordered, options, progress, threads))
-
-
-def iterate_pointmaps(
-    views: Sequence[View],
-    ordered: bool,
-    options: PointmapOptions,
-    progress: Progress = lambda step, done, total: None,
-    threads: int = 1,
-) -> Iterator[PointmapPair]:
-    """Ask a model, or read files, and give pair after pair at the pixels of the views.
+    """Ask a model, or read files: pairs at the pixels of the views.
 
     Outside a view's mask, where a model did not look and where its answer is no number, the
     confidence is 1. A model's answer on the CPU may depend on the number of threads.
@@ -128,8 +118,7 @@ def iterate_pointmaps(
         raise RequestError("Pointmaps need at least two photographs.")
     if options.method == "files":
         files = match_names(pointmap_files(options.files), views, options.file_names)
-        yield from read_pairs(files, views, options.edge_jump, progress)
-        return
+        return list(read_pairs(files, views, options.edge_jump, progress))
     kind = adapter(options.method)
     multi_view = hasattr(kind, "predict_views")
     graph = choose_graph(options.graph, len(views), ordered, multi_view, options.complete_up_to)
@@ -154,8 +143,8 @@ def iterate_pointmaps(
             progress("pointmaps", 0, 1)
             answers = _checked(kind.card, prepared, model.predict_views(prepared))
             progress("pointmaps", 1, 1)
-            yield from _pairs_of_views(pairs, views, prepared, answers, options)
-            return
+            return list(_pairs_of_views(pairs, views, prepared, answers, options))
+        found = []
         for done, (i, j) in enumerate(pairs):
             progress("pointmaps", done, len(pairs))
             answer = model.predict_pair(prepared[i], prepared[j])
@@ -163,28 +152,24 @@ def iterate_pointmaps(
             second = _at_view(
                 views[j], prepared[j], answer.points_j_in_i, answer.confidence_j, options
             )
-            yield PointmapPair(
-                views[i].name, views[j].name, first[0], second[0], first[1], second[1]
+            found.append(
+                PointmapPair(views[i].name, views[j].name, first[0], second[0], first[1], second[1])
             )
         progress("pointmaps", len(pairs), len(pairs))
+        return found
 
 
-class _threads:  # noqa: N801 - used as a function
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
     """torch on so many threads for a while."""
+    import torch
 
-    def __init__(self, count: int) -> None:
-        self._count = count
-
-    def __enter__(self) -> None:
-        import torch
-
-        self._before = torch.get_num_threads()
-        torch.set_num_threads(max(1, self._count))
-
-    def __exit__(self, *_: object) -> None:
-        import torch
-
-        torch.set_num_threads(self._before)
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, count))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _at_view(
