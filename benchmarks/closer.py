@@ -21,8 +21,8 @@ import workspaces
 
 from pipeline.artifacts.cameras import Camera
 from stages.evaluate.images.metrics import psnr
-from stages.splatting import render
 from stages.splatting.rasterizer import use_threads
+from stages.splatting.rendering import render
 
 Floats = npt.NDArray[np.floating]
 Image = npt.NDArray[np.uint8]

@@ -2,11 +2,10 @@
 
 from pipeline.store.faults import file_in_the_way, is_disk_full
 from pipeline.store.records import MANIFEST, read_own, write_sealed
-from pipeline.store.results import KEY_LENGTH, CorruptResultError, Result
+from pipeline.store.results import CorruptResultError, Result
 from pipeline.store.store import Store, partial_name
 
 __all__ = [
-    "KEY_LENGTH",
     "MANIFEST",
     "CorruptResultError",
     "Result",

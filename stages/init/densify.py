@@ -30,10 +30,10 @@ from stages.init.dental.reconstruct import PlacedTeeth
 from stages.init.dental.surface.dense import StartedSurface, completed_surface, started_surface
 from stages.init.placement import Placement
 from stages.init.write import save_all, save_matches
-from stages.stereo import DenseOptions, DenseView, dense_depths
 from stages.stereo.appearance import to_gray
 from stages.stereo.fill import continued
-from stages.stereo.reconstruct import complete_depths
+from stages.stereo.options import DenseOptions, DenseView
+from stages.stereo.reconstruct import complete_depths, dense_depths
 
 Array = npt.NDArray[np.float32]
 

@@ -11,8 +11,8 @@ from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
 from stages.fit.inputs.initial import Cloud, initial_gaussians
 from stages.fit.stage import FitConfig, FitStage
-from stages.splatting import render
 from stages.splatting.rasterizer import unpack
+from stages.splatting.rendering import render
 
 WIDTH, HEIGHT = 64, 48
 

@@ -13,9 +13,9 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
 from stages.fit.stage import FitConfig
-from stages.splatting import render
 from stages.splatting.light import LitScene
 from stages.splatting.rasterizer import Viewpoint, rasterize
+from stages.splatting.rendering import render
 from tests.stages import fit_case
 
 WIDTH, HEIGHT = 96, 72

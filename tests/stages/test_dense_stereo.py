@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.confidence import COMPLETED
-from stages.stereo import DenseOptions, DenseView, dense_depths
 from stages.stereo.aggregate import aggregate, decide
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.fill import continued
+from stages.stereo.options import DenseOptions, DenseView
 from stages.stereo.polish import polish, source_maps
+from stages.stereo.reconstruct import dense_depths
 from stages.stereo.sgbm import sgbm_depth
 from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
 from stages.stereo.sweep import cost_volume, stack_sources

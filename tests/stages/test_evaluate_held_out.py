@@ -19,7 +19,7 @@ from pipeline.untrusted.scenes.transforms import OPENCV_FROM_OPENGL
 from stages.evaluate.config import EvaluateConfig
 from stages.evaluate.stage import EvaluateStage
 from stages.evaluate.truth import scoring_mask
-from stages.splatting import render
+from stages.splatting.rendering import render
 from stages.views.orientation import make_stored
 from stages.views.working import prepare
 from tests.stages.evaluate_scene import arc, moved_world, rotation, textured_scene

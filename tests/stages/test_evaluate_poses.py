@@ -24,7 +24,7 @@ from pipeline.geometry.rigid import moved_by, rotation_angle
 from pipeline.geometry.similarity import camera_similarity, similarity
 from stages.evaluate.held_out import common_lens, register, without_lens
 from stages.evaluate.refinement import RefinementOptions, normal_equations, refine_camera
-from stages.splatting import render
+from stages.splatting.rendering import render
 from tests.stages.evaluate_scene import arc, moved_world, pose, rotation, textured_scene
 
 

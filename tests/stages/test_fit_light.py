@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.artifacts.views import View, Views
 from stages.fit.stage import FitStage
-from stages.splatting import render
+from stages.splatting.rendering import render
 from tests.stages.fit_case import run_until
 from tests.stages.lit_fit_case import HEIGHT, WIDTH, case, context, lit_image, looking
 

@@ -12,7 +12,7 @@ from stages.fit.inputs.scene import prepare
 from stages.fit.numerics.surface import inland, rim
 from stages.fit.parts.surface import BEHIND, CLEAR, WIDTH, Surface
 from stages.fit.stage import FitStage
-from stages.splatting import render
+from stages.splatting.rendering import render
 from tests.stages.fit_case import run_until
 from tests.stages.lit_fit_case import case, context
 

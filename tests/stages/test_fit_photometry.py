@@ -13,9 +13,9 @@ from pipeline.artifacts.views import View, Views
 from stages.fit import numerics
 from stages.fit.numerics.photometry import EXPONENTS
 from stages.fit.stage import FitStage
-from stages.splatting import render
 from stages.splatting.harmonics import harmonics
 from stages.splatting.rasterizer import Viewpoint
+from stages.splatting.rendering import render
 from tests.stages.lit_fit_case import bump, case, context, looking
 
 HELD = {"light": "none", "hold_surface": True}

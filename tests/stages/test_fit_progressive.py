@@ -16,8 +16,8 @@ from stages.fit.inputs.initial import Cloud, initial_gaussians
 from stages.fit.parts.camera import PoseOptimizer
 from stages.fit.parts.progressive import next_pose
 from stages.fit.stage import FitStage
-from stages.splatting import render
 from stages.splatting.rasterizer import unpack
+from stages.splatting.rendering import render
 from tests.stages.fit_case import StoppedError, case, context, looking, outputs, surface
 
 PLAIN = {

@@ -13,7 +13,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.geometry.rigid import exponential
 from stages.fit.stage import FitStage
-from stages.splatting import render
+from stages.splatting.rendering import render
 from tests.stages.fit_case import HEIGHT, WIDTH, StoppedError, case, context, outputs
 
 

@@ -10,7 +10,7 @@ from pipeline.stage import LocalContext
 from stages.init import densify
 from stages.init.config import InitConfig
 from stages.init.dental.reconstruct import PlacedTeeth
-from stages.stereo import DenseView
+from stages.stereo.options import DenseView
 from tests.stages.init_teeth_case import (
     FOCAL,
     SIZE,

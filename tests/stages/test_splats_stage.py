@@ -25,8 +25,8 @@ from stages.evaluate.stage import EvaluateConfig, EvaluateStage
 from stages.export.stage import ExportConfig, ExportStage
 from stages.splats.placing import said_background, share_in_view
 from stages.splats.stage import SplatsConfig, SplatsStage
-from stages.splatting import render
 from stages.splatting.frame import move_gaussians
+from stages.splatting.rendering import render
 from tests.stages import export_scene as scene
 
 #: our world -> the input's millimetres: turned about no axis in particular, 20 times as large

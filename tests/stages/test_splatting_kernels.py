@@ -9,11 +9,11 @@ import torch
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
-from stages.splatting import render
 from stages.splatting.adam import Adam
 from stages.splatting.kernels.tiles import TILE, fill_tiles, order_by_depth
 from stages.splatting.loss import ColourLoss
 from stages.splatting.rasterizer import Viewpoint, pack, rasterize, unpack, use_threads
+from stages.splatting.rendering import render
 
 WIDTH, HEIGHT = 70, 45
 

@@ -48,7 +48,7 @@ from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement
 from stages.init.write import save_all
-from stages.stereo import DenseOptions, DenseView
+from stages.stereo.options import DenseOptions, DenseView
 from stages.stereo.reconstruct import complete_depths
 
 Array = npt.NDArray[np.float64]
