@@ -248,9 +248,10 @@ def _label(
         candidates[view] = view_candidates(scorer, view, roles, fixed)
         if not candidates[view]:
             raise RequestError(
-                f"The tooth numbers given for {photos[view]} contradict each other: from left to "
-                "right each crown is the next tooth of its row; only two that touch may have the "
-                "same number, as parts of one."
+                f"The tooth numbers given for {photos[view]} contradict each other, or the teeth "
+                "beside and opposite them: from left to right each crown is the next tooth of its "
+                "row, and the same teeth of both jaws stand above each other; only two crowns that "
+                "touch may have one number, as parts of one."
             )
     progress("numbering the teeth", 0, 1)
     found = search(scorer, candidates)
