@@ -170,6 +170,9 @@ def test_a_tooth_that_is_not_there_is_named() -> None:
     assert entry["value"] is None
     assert entry["not_visible"] == "no photograph shows 13 with depth"
     assert found["intercanine_lower"]["value"] is not None
+    # a midline is that between two teeth
+    entry = measured(grown(4, missing=(21, 18, 28, 38, 48)))["midline_shift"]
+    assert entry["not_visible"] == "no photograph shows 21 with depth"
 
 
 def test_doubtful_numbers_give_nothing() -> None:

@@ -279,7 +279,10 @@ def _why(name: Name, group: Sequence[int], rule: Rule, reading: Reading) -> str:
     if any((mark := reading.get("edge", n)) and mark.doubt > MOST_DOUBT for n in seen):
         return f"it is not sure which tooth is {named}"
     if name == "mesial" and seen:
-        return f"no photograph from the front shows where {group[0]} and {group[1]} meet"
+        gone = [n for n in group if not {n, n + 40} & set(seen)]
+        if not gone:
+            return f"no photograph from the front shows where {group[0]} and {group[1]} meet"
+        named = str(gone[0])
     return f"no photograph shows {named} with depth"
 
 
