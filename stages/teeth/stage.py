@@ -69,7 +69,7 @@ class TeethStage(Stage):
         dentitions = [found[k] for k in read]
         pictures = {views[k].name: labelled_overlay(views[k].image, found[k]) for k in read}
         teeth = Teeth(tuple(found), pictures)
-        if teeth.chosen:
+        if any(dentition.all_crowns for dentition in dentitions):
             for name, dentition in zip(names, dentitions, strict=True):
                 if dentition.set_aside:
                     context.warn(f"{name} is not used to place the teeth: {dentition.set_aside}.")

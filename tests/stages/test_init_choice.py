@@ -81,6 +81,8 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
     with pytest.raises(ReconstructionError, match=r"1 of 3 do \(p0.jpg: .*check.html") as caught:
         auto(tmp_path / "a", 3, read)
     assert caught.value.artifacts == {"teeth": read}
+    with pytest.raises(ReconstructionError, match=r"0 of 3 do \(p0.jpg: .*p2.jpg: .*check.html"):
+        auto(tmp_path / "none", 3, read_teeth(aside=(0, 1, 2)))
     said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
     auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
     assert tried == [1]

@@ -196,6 +196,12 @@ def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path
         said(photo="q0")
 
 
+def test_why_photographs_are_set_aside_is_said_where_too_few_are_left(tmp_path, monkeypatch):
+    few = ReconstructionError("Two are needed.")
+    with pytest.raises(ReconstructionError, match=r"needed. p0.jpg: it shows.*; p2.*check.html"):
+        run(tmp_path / "w", monkeypatch, few, read_teeth(aside=(0, 2)))
+
+
 def test_a_photograph_said_to_be_mirrored_is_turned_over_with_its_teeth(tmp_path, monkeypatch):
     asked = []
     said = """

@@ -13,11 +13,13 @@ import pytest
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.stage import LocalContext
+from stages.dentition.crowns import dentition_of, outline_of
 from stages.teeth import reader
 from stages.teeth.config import TeethConfig
 from stages.teeth.read import Reading
 from stages.teeth.reader import PhotographReader
 from stages.teeth.stage import TeethStage
+from tests import teeth_case
 
 COUNT = 30
 
@@ -47,12 +49,16 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def run(folder: Path, **config: Any) -> Teeth:
+    teeth: Teeth = context(folder, **config).result("teeth")
+    return teeth
+
+
+def context(folder: Path, **config: Any) -> LocalContext:
     image = np.full((24, 32, 3), 0.5, np.float32)
     views = Views(tuple(View(f"{k:03d}", image) for k in range(COUNT)))
     context = LocalContext(TeethConfig(**config), folder, {"views": views})
     TeethStage().run(context)
-    teeth: Teeth = context.result("teeth")
-    return teeth
+    return context
 
 
 def test_of_a_film_some_frames_are_read_from_end_to_end(tmp_path: Path, asked: list[str]) -> None:
@@ -71,6 +77,22 @@ def test_the_reader_can_be_told_to_read_all_of_it_or_nothing(
     assert len(asked) == COUNT
     run(tmp_path / "none", method="none")
     assert len(asked) == COUNT
+
+
+@pytest.mark.parametrize("crowns", [0, 6])
+def test_where_all_photographs_of_teeth_are_set_aside_it_is_said_why(
+    tmp_path: Path, asked: list[str], monkeypatch: pytest.MonkeyPatch, crowns: int
+) -> None:
+    outlines = [outline_of(c) for c in teeth_case.dentition("000", "front").upper[:crowns]]
+
+    def aside(readings: list[Reading], *_: object) -> list[Dentition]:
+        names = [reading.dentition.name for reading in readings]
+        return [dentition_of(outlines, name, (32, 24), "front", set_aside="why") for name in names]
+
+    monkeypatch.setattr("stages.teeth.choose.choose", aside)
+    said = context(tmp_path, most_views=2).warnings
+    photographs = ["000", f"{COUNT - 1:03d}"] if crowns else []
+    assert said == [f"{name} is not used to place the teeth: why." for name in photographs]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import StageContext
-from stages.init.dental.read import labelled_teeth
-from stages.init.place import photo_name
+from stages.init.dental.read import labelled_teeth, set_aside_reasons
 from stages.init.sfm.matching.features import Features
 from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.sounding import sound
@@ -114,10 +113,10 @@ class ByTeeth:
     def with_what_was_set_aside(self, unplaced: ReconstructionError) -> ReconstructionError:
         """The failure of features; with the photographs that are missing for the teeth, if any."""
         teeth = labelled_teeth(self.context, self.views) if self.context.has("teeth") else None
-        if teeth is None or not teeth.chosen or len(teeth.chosen) >= DENTAL_VIEWS[0]:
+        shown = teeth is not None and any(view.all_crowns for view in teeth.views)
+        if teeth is None or not shown or len(teeth.chosen) >= DENTAL_VIEWS[0]:
             return unplaced
-        names = {view.name: photo_name(view) for view in self.views.views}
-        aside = "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
+        aside = set_aside_reasons(teeth, self.views)
         without = f" ({aside})" if aside else ""
         return ReconstructionError(
             f"{unplaced} By their teeth photographs are needed that show the closed bite from the "

@@ -20,7 +20,7 @@ from pipeline.stage import StageContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.mirror_images import SIDES, says_side
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.read import labelled_teeth, turned_as_said
+from stages.init.dental.read import labelled_teeth, set_aside_reasons, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
@@ -62,6 +62,11 @@ def from_teeth(context: StageContext, views: Views) -> None:
         kept = doubtful.artifacts.get("teeth")
         if isinstance(kept, TeethArtifact):
             doubtful.artifacts["teeth"] = updated(read, kept.views)
+        if len(read.chosen) < 2 and (aside := set_aside_reasons(read, views)):
+            raise ReconstructionError(
+                f"{doubtful} {aside}. If one was set aside wrongly, say so in check.html.",
+                doubtful.pictures, {"teeth": read},
+            ) from doubtful  # fmt: skip
         raise
     for doubt in (
         *teeth.fit.doubts, *only_two(names, teeth), *in_another_light(names, teeth),

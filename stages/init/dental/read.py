@@ -17,6 +17,7 @@ from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
 from pipeline.stage import StageContext
 from stages.dentition.corrections import apply_corrections
+from stages.init.place import photo_name
 
 
 def turned_as_said(context: StageContext, views: Views) -> Views:
@@ -45,6 +46,12 @@ def refuse_mirrored(context: StageContext, views: Views, known: Container[str]) 
             "init.cameras gives a camera for the picture as it is. Take `mirrored` out of the "
             "corrections, or leave init.cameras out."
         )
+
+
+def set_aside_reasons(teeth: Teeth, views: Views) -> str:
+    """Which photographs are set aside, and why; empty: none."""
+    names = {view.name: photo_name(view) for view in views.views}
+    return "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
 
 
 def labelled_teeth(context: StageContext, views: Views) -> Teeth:
