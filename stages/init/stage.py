@@ -182,7 +182,7 @@ def _from_features(context: StageContext, views: Views) -> None:
     """By features, or by teeth where these link photographs that features don't."""
     from pipeline.kernels.threads import side_by_side
     from stages.init.dental.choice import ByTeeth, neither
-    from stages.init.dental.read import turned_as_said
+    from stages.init.dental.read import turned_as_said, without_left_out
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
     from stages.init.sfm.options import RefinementOptions
@@ -190,8 +190,8 @@ def _from_features(context: StageContext, views: Views) -> None:
     config: InitConfig = context.config
     free = config.method == "auto"
     by_teeth, options = ByTeeth(context, views), _classical_options(config)
-    upright = turned_as_said(context, views)
-    focals = with_focals(views.views, config.focal)
+    upright = without_left_out(context, turned_as_said(context, views))
+    focals = with_focals(upright.views, config.focal)
     told: list[str] = []
     # what either way needs is loaded meanwhile; pycolmap in this thread, where signals can wait
     teeth_first, dense = side_by_side(
@@ -210,7 +210,7 @@ def _from_features(context: StageContext, views: Views) -> None:
     try:
         placement = place_classical(
             list(upright.views), focals, config.focal is not None, views.ordered,
-            least_views(len(views), config.min_views_fraction), options, refinement,
+            least_views(len(upright), config.min_views_fraction), options, refinement,
             seed=context.seed, threads=context.threads,
             scratch=context.scratch, progress=context.progress, warn=told.append,
             pictures=config.match_pictures, plain_features=by_teeth.features,
@@ -305,14 +305,14 @@ def _teeth_are_wide_apart(
 
 
 def _from_pointmaps(context: StageContext, views: Views, options: PointmapOptions) -> None:
-    from stages.init.dental.read import turned_as_said
+    from stages.init.dental.read import turned_as_said, without_left_out
     from stages.init.place import photo_name, with_focals
     from stages.init.write import save_all
     from stages.pointmaps.predict import predict_pointmaps
     from stages.pointmaps.quick_start import quick_start
 
     config: InitConfig = context.config
-    given, views = views, turned_as_said(context, views)
+    given, views = views, without_left_out(context, turned_as_said(context, views))
     pairs = predict_pointmaps(
         views.views, views.ordered, options, context.progress, context.threads
     )

@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.corrections import CORRECTIONS
 from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.artifacts.views import Views
-from pipeline.errors import ReconstructionError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init.config import InitConfig
 from stages.init.dental.choice import ByTeeth
@@ -251,6 +251,23 @@ def test_features_see_what_is_said_to_be_mirrored_turned_over(tmp_path, monkeypa
     for number, (view, given) in enumerate(zip(seen, photographs(3).views, strict=True)):
         expected = given.mirrored() if number == 1 else given
         np.testing.assert_array_equal(view.image, expected.image)
+
+
+def test_features_do_not_see_what_a_person_leaves_out(tmp_path, monkeypatch):
+    seen = []
+
+    def placed(views, focals, given, ordered, least, *_, **__):
+        seen.append(([view.name for view in views], len(focals), least))
+        raise ReconstructionError("0 of 3 photographs could be placed.")
+
+    monkeypatch.setattr("stages.init.place.place_classical", placed)
+    one = write(tmp_path / "one.yaml", "photographs: {p1.jpg: {use: false}}")
+    with pytest.raises(ReconstructionError):
+        auto(tmp_path / "w", 4, read_teeth(4), {CORRECTIONS: one}, method="colmap")
+    assert seen == [(["000", "002", "003"], 3, 3)]
+    most = write(tmp_path / "most.yaml", "photographs: {p1: {use: false}, p2: {use: false}}")
+    with pytest.raises(RequestError, match="leaves out 2 of 3 photographs"):
+        auto(tmp_path / "v", 3, read_teeth(), {CORRECTIONS: most}, method="colmap")
 
 
 def test_corrections_are_places_of_the_photograph_as_it_was_taken(tmp_path):

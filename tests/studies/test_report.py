@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import pipeline
+from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.metrics import Scores
 from pipeline.artifacts.pictures import Pictures
+from pipeline.artifacts.teeth import Dentition, Teeth
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.world import move_camera
 from pipeline.pages.charts import (
@@ -31,6 +33,7 @@ from pipeline.pages.tables import views_table
 from pipeline.running.outcomes import RunSummary
 from pipeline.studies.report import run_report
 from pipeline.studies.report.reading import read_case
+from stages.dentition.corrections import LEFT_OUT
 from stages.evaluate.images.pictures import comparison
 from stages.fit.report import course
 from stages.flow.report import flow_colors
@@ -70,6 +73,18 @@ def test_everything_that_is_there_is_shown(tmp_path: Path) -> None:
     assert page.count("<svg xmlns") == 6, "matrix, two of the cameras, three of the fit"
     for image in re.findall(r"<img[^>]*>", page.partition("<dialog")[0]):
         assert re.search(r'alt="[^"]{5,}"', image), image[-200:]
+
+
+def test_what_a_person_left_out_is_not_called_unplaced(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "w", ("views",))
+    asked = json.loads((workspace / "request.json").read_text()) | {"stages": ["views", "init"]}
+    (workspace / "request.json").write_text(json.dumps(asked))
+    teeth = Teeth((Dentition("002", (case.WIDTH, case.HEIGHT), "right", set_aside=LEFT_OUT),))
+    placed = Cameras(case.cameras().cameras[:2])
+    case.write_result(workspace, "init", [placed, case.points(9), teeth])
+    text = text_of(run_report(workspace).read_text())
+    assert "2 of 2 photographs placed in space" in text
+    assert "All 2 photographs were placed in space. Left out by hand: right.jpg." in text
 
 
 def test_names_and_warnings_are_text_and_not_markup(tmp_path: Path) -> None:

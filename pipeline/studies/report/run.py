@@ -112,12 +112,17 @@ def _only(kind: type[Some], parts: Iterable[Part]) -> list[Some]:
 
 def placed(case: Case) -> Iterator[Card | Fact]:
     """How many photographs have a camera."""
-    views, cameras = case.latest("views"), case.latest("cameras")
+    from stages.dentition.corrections import LEFT_OUT
+
+    views, cameras, teeth = (case.latest(kind) for kind in ("views", "cameras", "teeth"))
     if views is None or cameras is None:
         return
     known = cameras.by_name()
-    total = len(views.views)
-    unplaced = [view.source_name or view.name for view in views.views if view.name not in known]
+    without = {view.name: view.source_name or view.name for view in views.views
+               if view.name not in known}  # fmt: skip
+    read = teeth.views if teeth else ()
+    out = [without.pop(t.name) for t in read if t.set_aside == LEFT_OUT and t.name in without]
+    total, unplaced = len(views.views) - len(out), list(without.values())
     count = total - len(unplaced)
     yield Card(f"{count} of {total}", "photographs placed in space", poor=count < total)
     if not unplaced:
@@ -127,6 +132,8 @@ def placed(case: Case) -> Iterator[Card | Fact]:
             f"{len(unplaced)} of {total} photographs could not be placed and are not part of the "
             f"scene: {', '.join(unplaced)}."
         )
+    if out:
+        yield Fact(f"Left out by hand: {', '.join(out)}.")
 
 
 def closing(case: Case) -> Iterator[Card | Fact]:

@@ -16,7 +16,7 @@ from pipeline.artifacts.teeth import Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
 from pipeline.stage import StageContext
-from stages.dentition.corrections import apply_corrections
+from stages.dentition.corrections import LEFT_OUT, apply_corrections
 from stages.init.place import photo_name
 
 
@@ -26,6 +26,25 @@ def turned_as_said(context: StageContext, views: Views) -> Views:
         return views
     said = {seen.name for seen in labelled_teeth(context, views).views if seen.mirrored}
     return replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
+
+
+def without_left_out(context: StageContext, views: Views) -> Views:
+    """The views but for those that a person leaves out.
+
+    Raises:
+        RequestError: not two are left.
+    """
+    if CORRECTIONS not in context.sources or not context.has("teeth"):
+        return views
+    read = labelled_teeth(context, views).views
+    out = {seen.name for seen in read if seen.set_aside == LEFT_OUT}
+    kept = tuple(view for view in views.views if view.name not in out)
+    if len(kept) < 2:
+        raise RequestError(
+            f"{context.sources[CORRECTIONS]} leaves out {len(out)} of {len(views)} photographs; "
+            "two are needed."
+        )
+    return replace(views, views=kept)
 
 
 def refuse_mirrored(context: StageContext, views: Views, known: Container[str]) -> None:
