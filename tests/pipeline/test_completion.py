@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from pipeline.config import presets
 from pipeline.front import completion
 from pipeline.stage import stage_names
@@ -24,8 +26,10 @@ def test_presets() -> None:
 
 
 def test_settings() -> None:
-    [(name, meaning)] = completion.setting("fit.iterations")
+    (name, meaning), (default, _) = completion.setting("fit.iterations")
     assert name == "fit.iterations=" and meaning
+    assert default == "fit.iterations=auto", "a space would follow what is alone"
+    assert completion.setting("views.masks")[1][0] == "views.masks=null"
     assert [name for name, _ in completion.setting("export.frame=m")] == ["export.frame=mouth"]
     assert [name for name, _ in completion.setting("export.mesh=")] == [
         "export.mesh=true", "export.mesh=false",
@@ -33,15 +37,27 @@ def test_settings() -> None:
     assert completion.setting("nosuch.x") == []
 
 
-def test_the_shell_is_answered() -> None:
-    """As bash asks: the program itself, with the line in its environment."""
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        ("pipeline run --from ex", ["export"]),
+        ("pipeline run --set export.mesh =", ["true", "false"]),
+        ("pipeline run --set export.frame = m", ["mouth"]),
+        ("pipeline run --set = export.frame = m", ["mouth"]),
+        ("pipeline run --set fit.iterations = 5 --set = flow.min_te", ["flow.min_texture="]),
+        ("pipeline run --set fit.iterations = 5 --from ev", ["evaluate"]),
+    ],
+)
+def test_bash_is_answered(words: str, answer: list[str]) -> None:
+    """As it asks: the program itself, with the line in its environment, apart at each ``=``."""
+    given = words.split()
     asked = {
         "_PIPELINE_COMPLETE": "complete_bash",
-        "COMP_WORDS": "pipeline run --from ex", "COMP_CWORD": "3",
+        "COMP_WORDS": "\n".join(given), "COMP_CWORD": str(len(given) - 1),
     }  # fmt: skip
     code = "import sys; sys.argv[0] = 'pipeline'; from pipeline.cli import main; main()"
     told = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True,
         check=False,
     )  # fmt: skip
-    assert told.stdout.split() == ["export"], told.stderr
+    assert told.stdout.split()[: len(answer)] == answer, told.stderr
