@@ -134,7 +134,7 @@ def make_request(
             kept, left_out = installed_here(kept)
             named_preset, overrides = remembered["preset"], [*kept, *now]
             taken_over = _as_options(named_preset, kept)
-        given = [p for p in remembered.get("images", []) if _still_there(p)]
+        given = remembered.get("images", [])
     return Request(
         workspace=folder,
         images=tuple(os.path.abspath(p) for p in given),  # noqa: PTH100 - keeps glob characters
@@ -277,14 +277,14 @@ def status(
     if preset is None:
         preset, (kept, _) = remembered["preset"], installed_here(remembered["overrides"])
         taken_over = _as_options(preset, kept)
-    request = make_request(
-        request.images, request.workspace, preset, [*kept, *request.overrides], stages
-    )  # fmt: skip
+    images = request.images
+    there = [path for path in images if request.images_named or _still_there(path)]
+    request = make_request(there, request.workspace, preset, [*kept, *request.overrides], stages)
     config = config_of(replace(request, taken_over=taken_over))
     store = Store(request.workspace, verify=verify)
     chain = resolve_chain(config, request.stages, request.from_stage, request.images_named, store)
     found = []
-    for plan in plan_chain(chain, config, store, request.images):
+    for plan in plan_chain(chain, config, store, request.images if there else images):
         result = plan.result or store.current(plan.name)
         found.append(
             StageStatus(

@@ -334,6 +334,23 @@ def test_workspace_remembers_its_photographs(run: Any) -> None:
     assert run("read.keep=1", images=(), stages=["read", "scale"])["read"] == "ran"
 
 
+def test_photographs_that_are_away_for_a_while_are_not_forgotten(run: Any, toys: Path) -> None:
+    run()
+    (toys / "images").rename(toys / "elsewhere")
+    assert run("scale.factor=5", images=())["scale"] == "ran"
+    found = pipeline.status(workspace=toys / "w")
+    assert [stage.state for stage in found] == ["cached"] * 3, "all but what reads them"
+    for ask in (lambda: run("read.keep=1", images=()), lambda: status_of(toys, "read")):
+        with pytest.raises(pipeline.RequestError, match="images can't be read"):
+            ask()
+    (toys / "elsewhere").rename(toys / "images")
+    assert run("read.keep=1", images=())["read"] == "ran"
+
+
+def status_of(toys: Path, *stages: str) -> Any:
+    return pipeline.status(workspace=toys / "w", stages=stages)
+
+
 def test_photographs_are_read_again_with_other_settings(run: Any) -> None:
     run()
     assert "read" not in run(images=())
