@@ -252,7 +252,7 @@ class Runner:
             return self.store.commit(name, key, manifest, context.outputs)
         except CorruptResultError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a library's own command may exit
             signals.check()
             raise self._fail(error, name, key) from error
 
@@ -273,7 +273,7 @@ class Runner:
         names = (*self.chain.upstream, *self.chain.names)
         return [found[name].thrift for name in names if name in found and found[name].thrift]
 
-    def _fail(self, error: Exception, name: str, key: str) -> PipelineError:
+    def _fail(self, error: BaseException, name: str, key: str) -> PipelineError:
         """The failure as it is told; the store is left as it was, but for a record of it."""
         failure = explained(error, name, self.request.workspace, self._thrift())
         with contextlib.suppress(OSError):  # the first error is the one to tell

@@ -69,4 +69,5 @@ class RunContext(StageContext):
         self._reporter.message(f"{self._planned.name}: {message}")
 
     def summarize(self, **figures: float | int | str) -> None:
-        self.figures.update(figures)
+        for name, value in figures.items():  # a sum of an array is numpy's, and no JSON
+            self.figures[name] = value.item() if hasattr(value, "item") else value

@@ -13,7 +13,7 @@ from pipeline.store import file_in_the_way, is_disk_full
 
 
 def explained(
-    error: Exception, stage: str, workspace: Path, thrift: Iterable[str] = ()
+    error: BaseException, stage: str, workspace: Path, thrift: Iterable[str] = ()
 ) -> PipelineError:
     """Any failure of a stage as one that is told in one paragraph.
 

@@ -107,7 +107,7 @@ class Store:
         except OSError as error:
             raise RequestError(
                 f"The workspace {self.root} can't be written to ({reason_of(error)}). Choose "
-                "another folder with -w, or mend its permissions."
+                "another folder with -w (or -o), or mend its permissions."
             ) from error
         for stage in stages:
             if is_there(self.root / stage):

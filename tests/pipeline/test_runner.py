@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from toy import STAGES, ToyEntryPoint, artifact_bytes
 
@@ -206,6 +207,7 @@ def test_a_quota_is_not_called_a_full_disk(tmp_path: Path, number: int, said: st
     [
         ("data", "ReconstructionError", "share too little"),
         ("bug", "StageError", r"a fault of ours: ZeroDivisionError: oops \(toy.py, line \d+\)"),
+        ("exit", "StageError", "a fault of ours: SystemExit: 7"),
         ("disk", "RequestError", "is full .* Nothing computed before is lost"),
     ],
 )
@@ -232,6 +234,17 @@ def test_pictures_of_a_failure_are_kept_until_a_run_succeeds(run: Any, toys: Pat
     assert (folder / "pair.png").exists()
     run()
     assert not folder.exists()
+
+
+def test_figures_may_be_numpy_s(run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def count(self: Any, context: Any) -> None:
+        context.save(context.load("numbers"))
+        context.summarize(total=np.int64(7), mean=np.float32(0.5), all=np.bool_(True))
+
+    monkeypatch.setattr("toy.ScaleStage.run", count)
+    run(stages=["read", "scale"])
+    found = pipeline.status(workspace=toys / "w")
+    assert found[1].summary == {"total": 7, "mean": 0.5, "all": True}
 
 
 def test_a_stage_may_provide_a_kind_for_some_input_only(run: Any, toys: Path) -> None:

@@ -120,6 +120,8 @@ class CountStage(Stage):
             )
         if how == "bug":
             raise ZeroDivisionError("oops")
+        if how == "exit":
+            raise SystemExit(7)
         if how == "disk":
             raise OSError(28, "No space left on device")
         if how == "interrupt":
