@@ -199,6 +199,14 @@ def _nobody_provides(name: str, kinds: Sequence[str], chain: Chain, held: set[st
     usable = usable_stages()
     others = {n: stage for n, stage in usable.items() if n != name}
     makers = {kind: [n for n, s in others.items() if kind in s.provides] for kind in kinds}
+    later = chain.names[chain.names.index(name) + 1 :]
+    late = [maker for maker in later if any(maker in makers[kind] for kind in kinds)]
+    if late:
+        return (
+            f"The stage '{name}' needs what {' and '.join(late)} would make, which --stages "
+            f"{','.join(chain.names)} names after it. Stages run in the order given: name "
+            f"{' and '.join(late)} before {name}."
+        )
     if all(makers[kind] for kind in kinds) and all(
         usable[maker].uses_sources for names in makers.values() for maker in names
     ):

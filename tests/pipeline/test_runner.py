@@ -93,6 +93,12 @@ def test_stage_without_its_input_is_refused(run: Any, toys: Path) -> None:
     assert not (toys / "w").exists()
 
 
+def test_stages_in_another_order_than_they_need(run: Any) -> None:
+    run()
+    with pytest.raises(pipeline.RequestError, match="order given: name count before publish"):
+        run(stages=["publish", "count"])
+
+
 def test_from_begins_in_the_middle(run: Any) -> None:
     run()
     assert run("count.steps=3", from_stage="count") == {
