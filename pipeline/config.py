@@ -221,9 +221,13 @@ def anchored(change: str, begin: str | Path = "") -> str:
 
 
 def yaml_value(value: Any) -> str:
-    """A value as --set has it."""
+    """A value as --set has it, also that of a path or of numpy."""
     import yaml
 
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    elif hasattr(value, "item"):
+        value = value.item()
     text = yaml.safe_dump(value, default_flow_style=True, width=10**6)
     return text.removesuffix("\n").removesuffix("\n...")
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 import pipeline
@@ -170,6 +171,13 @@ def test_names_may_be_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     asked = make_request(overrides=["views.masks=1.50", "views.held_out=[1, 02]"], workspace="w")
     views: Any = load_config(None, asked.overrides).sections["views"]
     assert (views.masks, views.held_out) == (tmp_path / "1.50", ("1", "02"))
+
+
+def test_values_of_a_program_may_be_paths_and_numpy_s(tmp_path: Path) -> None:
+    given = {"views.masks": tmp_path / "12", "fit.iterations": np.int64(50), "seed": np.uint8(3)}
+    config = load_config(None, make_request(overrides=given, workspace="w").overrides)
+    views, fit = (cast(Any, config.sections[name]) for name in ("views", "fit"))
+    assert (views.masks, fit.iterations, config.run.seed) == (tmp_path / "12", 50, 3)
 
 
 def test_presets_that_never_end_are_refused(tmp_path: Path) -> None:
