@@ -37,10 +37,17 @@ def compare_command(
     ] = False,
     ground_truth: Annotated[
         Path | None,
-        typer.Option("--ground-truth", help="True cameras: transforms.json or a COLMAP model."),
+        typer.Option(
+            "--ground-truth",
+            help="True cameras: transforms.json or a COLMAP model; default: what the run was "
+            "evaluated with.",
+        ),
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option("--mesh", help="True surface, in the frame of --ground-truth.")
+        Path | None,
+        typer.Option(
+            "--mesh", help="True surface, in the frame of --ground-truth; default: evaluate.mesh."
+        ),
     ] = None,
     fit: Annotated[
         bool, typer.Option("--fit/--no-fit", help="Also fit from COLMAP's cameras and points.")

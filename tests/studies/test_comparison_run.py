@@ -1,6 +1,7 @@
 """`pipeline compare` on the sample photographs, and runs on a COLMAP model's cameras and points."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ from pipeline.artifacts.points import Points
 from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
+from pipeline.running.reporter import Reporter
 from pipeline.stage import LocalContext
 from pipeline.store import Store
 from pipeline.studies.compare.compare import compare
@@ -81,6 +83,30 @@ def test_the_whole_comparison(workspace, model):
     assert "COLMAP, given model 3/3 1 (3)" in report
     assert "COLMAP's cameras and points 3 20" in report
     assert "it tells of earlier results" not in report
+
+
+def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_path):
+    home = tmp_path / "w"
+    shutil.copytree(workspace, home, symlinks=True)
+    truth = tmp_path / "transforms.json"
+    shutil.copy(SAMPLES / "transforms.json", truth)
+    changes = {**SETTINGS, "evaluate.ground_truth": str(truth)}
+    pipeline.run(PHOTOS, workspace=home, overrides=changes, stages=["evaluate"])
+    found = compare(home, colmap=model, fit=False)
+    assert found.figures["reference"] == "ground truth"
+    truth.unlink()
+    told = Told()
+    found = compare(home, colmap=model, fit=False, reporter=told)
+    assert found.figures["reference"] == "COLMAP, given model"
+    assert any("--ground-truth names it where it is now" in message for message in told.messages)
+
+
+class Told(Reporter):
+    def __init__(self):
+        self.messages = []
+
+    def message(self, text):
+        self.messages.append(text)
 
 
 def test_the_report_says_when_a_comparison_is_of_earlier_results(tmp_path):

@@ -87,8 +87,9 @@ def compare(
         workspace: of a run; its results in use are compared as they are.
         colmap: folder of a COLMAP model of the same photographs (or with numbered models in it).
         run_colmap: run COLMAP here, with its defaults and with a setting for few views.
-        ground_truth: transforms.json or COLMAP model with the true cameras.
-        mesh: true surface in the frame of `ground_truth`.
+        ground_truth: transforms.json or COLMAP model with the true cameras; None: the one that the
+            run was evaluated with, if any.
+        mesh: true surface in the frame of `ground_truth`; None: as above.
         fit: also fit from COLMAP's cameras and points, with the settings of the workspace.
         threads: 0 means all cores.
         reporter: hears of the progress.
@@ -113,6 +114,9 @@ def _compare(
 ) -> Comparison:  # fmt: skip
     store, prepared = _workspace(home)
     views = _loaded(store, prepared, "views").views
+    if ground_truth is None:
+        ground_truth = _of_the_run(store, "ground_truth", reporter)
+        mesh = mesh or (ground_truth and _of_the_run(store, "mesh", reporter))
     _check(colmap, run_colmap, ground_truth, mesh)
     given = read_largest(Path(colmap), views) if colmap is not None else None
     truth: dict[str, Camera] = {}
@@ -188,6 +192,20 @@ def _loaded(store: Store, result: Result, kind: str) -> Any:
             f"The cached result of '{result.stage}' is damaged ({error}) and was moved aside. Run "
             "'pipeline run' again to make it anew."
         ) from error
+
+
+def _of_the_run(store: Store, setting: str, reporter: Reporter) -> Path | None:
+    """The file that the run was evaluated with."""
+    used = store.current("evaluate")
+    named = used.manifest["config"].get(setting) if used else None
+    if named is None or Path(named).exists():
+        return Path(named) if named else None
+    option = setting.replace("_", "-")
+    reporter.message(
+        f"evaluate.{setting} of the run is not there any more ({named}), and nothing is compared "
+        f"with it. --{option} names it where it is now."
+    )
+    return None
 
 
 def _check(
