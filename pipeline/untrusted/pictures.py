@@ -317,7 +317,7 @@ def _tiff(data: bytes) -> Header:
         tag, kind = struct.unpack_from(order + "HH", data, entry)
         amount = struct.unpack_from(order + ("Q" if big else "I"), data, entry + 4)[0]
         inline = {1: "B", 3: "H", 4: "I", 16: "Q"}.get(kind)
-        if tag in (256, 257, 258, 259, 277, 284):
+        if tag in (256, 257, 258, 259, 262, 277, 284):
             if tag in found:
                 raise UnusableFile(f"is damaged: its header names tag {tag} twice")
             if inline is None or amount < 1 or (inline == "Q" and not big):
@@ -331,6 +331,13 @@ def _tiff(data: bytes) -> Header:
     bits, samples = found.get(258, 1), found.get(277, 1)
     if not 1 <= samples <= 8 or bits > 64:
         raise UnusableFile(f"has {samples} channels of {bits} bits, as no photograph has")
+    planar = samples > 1 and found.get(284, 1) == 2
+    if bits == 16 and (planar or found.get(262) == 0):
+        how = "one channel after the other" if planar else "as a negative"
+        raise UnusableFile(
+            f"holds 16 bits a channel {how}, which is not read right. Save it as PNG, or as TIFF "
+            "with interleaved channels"
+        )
     # A file of one strip is held three times: as it is, decoded, and as a picture.
     memory = 14.0 if bits <= 8 else 4.0 + 3 * samples * bits / 8
     return Header("TIFF", found.get(256, 0), found.get(257, 0), bits, memory)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,23 @@ def test_sixteen_bits_are_scaled_linearly(suffix: str, channels: int) -> None:
         np.testing.assert_array_equal(photo.valid, np.arange(100)[None].repeat(80, 0) >= 30)
     else:
         assert photo.valid is None
+
+
+@pytest.mark.parametrize(("tag", "value", "says"), [(284, 2, "one channel"), (262, 0, "negative")])
+def test_sixteen_bits_that_no_decoder_reads_right_are_refused(
+    tag: int, value: int, says: str
+) -> None:
+    ok, written = cv2.imencode(".tiff", np.zeros((80, 100, 3), np.uint16))
+    assert ok
+    data = bytearray(written.tobytes())
+    assert decode_photo(bytes(data)).rgb.shape == (80, 100, 3)
+    (start,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, start)
+    places = [start + 2 + 12 * number for number in range(count)]
+    tags = {struct.unpack_from("<H", data, place)[0]: place for place in places}
+    struct.pack_into("<H", data, tags[tag] + 8, value)
+    with pytest.raises(UnusableFile, match=says):
+        decode_photo(bytes(data))
 
 
 def test_cmyk_without_and_with_an_unfitting_profile() -> None:
