@@ -37,7 +37,7 @@ class SwapStage(Stage):
     """cameras of earlier stages -> those of a model, in the same world."""
 
     name: ClassVar[str] = "swap"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     summary: ClassVar[str] = "put a COLMAP model's cameras in place of those of the earlier stages"
     Config: ClassVar[type[StageConfig]] = SwapConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras")

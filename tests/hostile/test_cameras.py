@@ -203,6 +203,27 @@ def test_what_cameras_may_have_is_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(centre, [1.5] * 3, atol=1e-3)
 
 
+def test_all_of_a_lens_counts(tmp_path: Path) -> None:
+    """A fisheye as instant-ngp calls it, and the k3 that Metashape finds."""
+    data = cameras()
+    data["frames"][0].update(k1=0.1, k3=0.02, is_fisheye=True)
+    data["frames"][1].update(k1=0.1, k3=0.02, is_fisheye=False)
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    found, _ = read_cameras(model_files(tmp_path).values())
+    assert [one.lens.model_name for one in found] == ["OPENCV_FISHEYE", "FULL_OPENCV", "OPENCV"]
+    assert found[0].lens.params.tolist()[4:] == [0.1, 0, 0.02, 0]
+    ray = np.array([[0.3, -0.2, 1.0]])
+    square = 0.3**2 + 0.2**2
+    bent = ray[0, :2] * (1 + 0.1 * square + 0.02 * square**3)
+    pixel = found[1].lens.img_from_cam(ray)[0]
+    straight = found[2].lens.img_from_cam(np.array([[*bent, 1.0]]))[0]
+    np.testing.assert_allclose(pixel, straight, atol=1e-6)
+    data["frames"][1]["k4"] = 0.01
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(RequestError, match=r"k4 0\.01 in frame 1"):
+        read_cameras(model_files(tmp_path).values())
+
+
 def test_a_stage_refuses_them_too(tmp_path: Path) -> None:
     data = cameras()
     data["frames"][1]["fl_x"] = 0

@@ -146,13 +146,23 @@ def _lens(said: _Fields) -> Lens:
             f"has camera_model {_shown(model)} in {said.where}; those that can be used are "
             f"{', '.join(_STRAIGHT + _FISHEYE)}"
         )
-    fisheye = model in _FISHEYE
+    fisheye = model in _FISHEYE or said.get("is_fisheye") is True  # as instant-ngp has it
     bent = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
     parameters = (
         fx, float(said.number("fl_y", fx)), float(said.number("cx", width / 2)),
         float(said.number("cy", height / 2)), *(float(said.number(name, 0)) for name in bent),
     )  # fmt: skip
-    return Lens("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, parameters)
+    if fisheye:
+        return Lens("OPENCV_FISHEYE", width, height, parameters)
+    if said.number("k4", 0) != 0:
+        raise UnusableFile(
+            f"has k4 {_shown(said.get('k4'))} in {said.where}, which programs do not agree upon "
+            f"for {model}: find the cameras with k1, k2, k3, p1 and p2 only"
+        )
+    k3 = float(said.number("k3", 0))
+    if k3 == 0:
+        return Lens("OPENCV", width, height, parameters)
+    return Lens("FULL_OPENCV", width, height, (*parameters, k3, 0.0, 0.0, 0.0))
 
 
 def _matrix(value: object, where: str) -> Array:
