@@ -18,9 +18,11 @@ from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, rea
 from stages.views.reading.apart import Decoder
 from stages.views.reading.video import VideoFrame, Wanted, map_frames
 from stages.views.sheets import photographs_in
-from stages.views.working import Box, Mask, Prepared, check_size, prepare
+from stages.views.working import Box, Mask, Prepared, UnusableMask, check_size, prepare
 
 Progress = Callable[[int, int], None]
+
+MASK_ADVICE = "Mend the mask, or take it out of views.masks, and run the same command."
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def load_photos(
         RequestError: some can't be used; all of them are named.
     """
 
-    def load(label: str) -> list[Loaded] | str:
+    def load(label: str) -> list[Loaded] | UnusableFile:
         try:
             data = read(files[label], PHOTOGRAPH)
             # a row of photographs is long and low: these are checked one by one
@@ -84,19 +86,19 @@ def load_photos(
                 for box in boxes
             ]
         except UnusableFile as error:
-            return f"{label} {error}"
+            return type(error)(f"{label} {error}")
         digest = hashlib.sha256(data).hexdigest()
         if len(pictures) == 1:
             return [Loaded(label, digest, pictures[0], taken_at=photo.taken_at)]
         return [Loaded(f"{label}#{k}", digest, picture) for k, picture in enumerate(pictures, 1)]
 
     loaded: list[Loaded] = []
-    problems: list[str] = []
+    problems: list[UnusableFile] = []
     with Decoder() as decoder, ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
         try:
             for number, result in enumerate(pool.map(load, files), 1):
                 progress(number, len(files))
-                if isinstance(result, str):
+                if isinstance(result, UnusableFile):
                     problems.append(result)
                 else:
                     loaded += result
@@ -156,6 +158,8 @@ def load_video(
             Loaded(f"{label}#{index}", digest, picture, seconds)
             for index, seconds, picture, _ in found
         ]
+    except UnusableMask as error:
+        raise RequestError(f"The video {label} {error}. {MASK_ADVICE}") from error
     except UnusableFile as error:
         raise RequestError(
             f"The video {label} {error}. Check that it plays, save it again as MP4 (H.264), or "
@@ -255,17 +259,15 @@ def _read_mask(path: Path, decoder: Decoder) -> Mask:
     try:
         return decoder.mask(read(path, PHOTOGRAPH))
     except UnusableFile as error:
-        raise UnusableFile(f"has a mask ({path.name}) that {error}") from error
+        raise UnusableMask(f"has a mask ({path.name}) that {error}") from error
 
 
-def _refuse(problems: Sequence[str], total: int) -> None:
-    if len(problems) == 1:
-        raise RequestError(
-            f"A photograph can't be used: {problems[0]}. Copy it again from the camera, or remove "
-            "it, and run the same command."
-        )
-    shown = "; ".join(problems[:8]) + ("; ..." if len(problems) > 8 else "")
-    raise RequestError(
-        f"{len(problems)} of {total} photographs can't be used: {shown}. Copy them again from the "
-        "camera, or remove them, and run the same command."
-    )
+def _refuse(problems: Sequence[UnusableFile], total: int) -> None:
+    shown = "; ".join(map(str, problems[:8])) + ("; ..." if len(problems) > 8 else "")
+    what, them = "A photograph", "it"
+    if len(problems) > 1:
+        what, them = f"{len(problems)} of {total} photographs", "them"
+    advice = f"Copy {them} again from the camera, or remove {them}, and run the same command."
+    if all(isinstance(problem, UnusableMask) for problem in problems):
+        advice = MASK_ADVICE
+    raise RequestError(f"{what} can't be used: {shown}. {advice}")

@@ -16,6 +16,10 @@ from stages.views.orientation import make_stored, make_upright, upright_from_sto
 Mask = npt.NDArray[np.bool_]
 
 
+class UnusableMask(UnusableFile):
+    """A photograph can't be used because of the mask that was given for it."""
+
+
 class Box(NamedTuple):
     """Rows top to bottom and columns left to right of a picture, the ends not among them."""
 
@@ -89,7 +93,8 @@ def prepare(
         box: the part of the stored grid that becomes the picture; None for all.
 
     Raises:
-        UnusableFile: the mask has another shape than the picture, or leaves nothing of it.
+        UnusableMask: the mask has another shape than the picture, or leaves nothing of it.
+        UnusableFile: the picture is transparent all over.
     """
     height, width = rgb.shape[:2]
     whole = Box(0, 0, height, width)
@@ -112,7 +117,9 @@ def prepare(
         share = given if share is None else np.minimum(share, given)
     mask = None if share is None else share >= 0.5
     if mask is not None and not mask.any():
-        raise UnusableFile("is masked completely (by its mask file or its transparency)")
+        if given_mask is None:
+            raise UnusableFile("is transparent all over")
+        raise UnusableMask("is masked completely (by its mask file, or that and its transparency)")
     if mask is not None and mask.all():
         mask = None
     return Prepared(
@@ -143,7 +150,7 @@ def _fit_mask(mask: Mask, width: int, height: int, orientation: int) -> Mask:
         return mask
     if same_shape(size, (width, height)):
         return make_upright(mask, orientation)
-    raise UnusableFile(
+    raise UnusableMask(
         f"has {upright[0]} x {upright[1]} pixels, but its mask {size[0]} x {size[1]}: the mask "
         "must have the picture's proportions"
     )

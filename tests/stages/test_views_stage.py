@@ -216,8 +216,10 @@ def test_one_bad_file_and_one_bad_mask(tmp_path: Path) -> None:
     write(tmp_path / "in" / "b.jpg", picture(2))
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "b.png").write_bytes(b"")
-    with pytest.raises(RequestError, match=r"b\.jpg has a mask \(b\.png\) that is empty"):
+    with pytest.raises(RequestError, match=r"b\.jpg has a mask \(b\.png\) that is empty") as caught:
         run_stage(tmp_path / "out", [tmp_path / "in"], masks=tmp_path / "masks")
+    assert "views.masks" in str(caught.value)  # the photograph is good
+    assert "from the camera" not in str(caught.value)
 
 
 def artifact_bytes(folder: Path) -> dict[str, bytes]:

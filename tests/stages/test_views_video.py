@@ -219,6 +219,11 @@ def test_one_mask_for_the_film(tmp_path: Path) -> None:
     views, _ = run_stage(tmp_path / "out", path, masks=tmp_path / "masks")
     for view in views.views:
         np.testing.assert_array_equal(view.mask, mask > 0)
+    Image.fromarray(mask[:, :96]).save(tmp_path / "masks" / "x.png")
+    with pytest.raises(RequestError, match="proportions") as caught:
+        run_stage(tmp_path / "again", path, masks=tmp_path / "masks")
+    assert "Mend the mask" in str(caught.value)
+    assert "MP4" not in str(caught.value)  # the film is good
 
 
 @pytest.mark.parametrize("turned", [False, True])
