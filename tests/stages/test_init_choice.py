@@ -78,11 +78,15 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
         "stages.init.dental.place.from_teeth", lambda context, views: tried.append(1)
     )
     read = read_teeth(aside=(0, 1))
-    with pytest.raises(ReconstructionError, match=r"1 of 3 do \(p0.jpg: .*check.html") as caught:
+    with pytest.raises(ReconstructionError, match=r"1 of 3 do \(p0.jpg, p1.jpg: .*check") as caught:
         auto(tmp_path / "a", 3, read)
     assert caught.value.artifacts == {"teeth": read}
-    with pytest.raises(ReconstructionError, match=r"0 of 3 do \(p0.jpg: .*p2.jpg: .*check.html"):
+    with pytest.raises(ReconstructionError, match=r"0 of 3 do \(p0.jpg, p1.jpg, p2.jpg: .*check"):
         auto(tmp_path / "none", 3, read_teeth(aside=(0, 1, 2)))
+    with pytest.raises(
+        ReconstructionError, match=r"1 of 8 do \(p0.jpg, p1.jpg, p2.jpg and 4 more: "
+    ):
+        auto(tmp_path / "film", 8, read_teeth(8, aside=range(7)))
     said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
     auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
     assert tried == [1]

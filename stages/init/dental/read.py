@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import replace
 
 from pipeline.artifacts.dental.corrections import (
@@ -18,6 +18,9 @@ from pipeline.errors import RequestError
 from pipeline.stage import StageContext
 from stages.dentition.corrections import LEFT_OUT, apply_corrections
 from stages.init.place import photo_name
+
+#: Photographs that are named one by one where one thing is said of several.
+MOST_NAMED = 3
 
 
 def turned_as_said(context: StageContext, views: Views) -> Views:
@@ -70,7 +73,17 @@ def refuse_mirrored(context: StageContext, views: Views, known: Container[str]) 
 def set_aside_reasons(teeth: Teeth, views: Views) -> str:
     """Which photographs are set aside, and why; empty: none."""
     names = {view.name: photo_name(view) for view in views.views}
-    return "; ".join(f"{names[d.name]}: {d.set_aside}" for d in teeth.views if d.set_aside)
+    reasons: dict[str, list[str]] = {}
+    for dentition in teeth.views:
+        if dentition.set_aside:
+            reasons.setdefault(dentition.set_aside, []).append(names[dentition.name])
+    return "; ".join(f"{_some(those)}: {reason}" for reason, those in reasons.items())
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names for a sentence: frames of a film are many."""
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more
 
 
 def labelled_teeth(context: StageContext, views: Views) -> Teeth:
