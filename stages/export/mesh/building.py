@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
@@ -20,6 +19,7 @@ from stages.export.mesh.surface import (
     DEEPEST_OCTREE,
     Mesh,
     drop_small_parts,
+    few_queries,
     keep_near,
     keep_vertices,
     poisson,
@@ -108,13 +108,18 @@ def made_of(guessed: Floats, vertices: Array, trusted: Points, voxel: float) -> 
         trusted: points as the fit found them; bent, those that guessed ones hide are on these.
         voxel: world units.
     """
+    made = np.zeros(len(vertices), bool)
     if not len(guessed):
-        return np.zeros(len(vertices), bool)
-    near, places = cKDTree(trusted.positions).query(vertices, PLANES)
-    away = vertices[:, None] - trusted.positions[places]
+        return made
+    tree = few_queries(trusted.positions)
+    nearest, _ = tree.query(vertices)
+    guess, _ = few_queries(guessed).query(vertices)
+    asked = guess < nearest
+    _, places = tree.query(vertices[asked], PLANES)
+    away = vertices[asked, None] - trusted.positions[places]
     off = np.abs((away * trusted.normals[places]).sum(-1)).min(1)
-    other, _ = cKDTree(guessed).query(vertices)
-    return np.asarray((other < near[:, 0]) & (off > OFF_PLANE * voxel))
+    made[asked] = off > OFF_PLANE * voxel
+    return made
 
 
 def clean_mesh(surface: Mesh, most_faces: int, voxel: float) -> Mesh | None:

@@ -86,7 +86,7 @@ def poisson(
 
 def keep_near(mesh: Mesh, support: npt.NDArray[np.floating], reach: float) -> Mesh:
     """The part of a mesh with a point of `support` [N, 3] within `reach` of each vertex."""
-    tree = _tree(np.asarray(support, np.float64))
+    tree = few_queries(np.asarray(support, np.float64))
     distance, _ = tree.query(mesh.vertices, distance_upper_bound=np.nextafter(reach, np.inf))
     return keep_vertices(mesh, distance <= reach)
 
@@ -94,11 +94,11 @@ def keep_near(mesh: Mesh, support: npt.NDArray[np.floating], reach: float) -> Me
 def spacing(points: npt.NDArray[np.floating]) -> float:
     """Median distance of points [N, 3], N >= 2, to their nearest neighbours."""
     cloud = np.asarray(points, np.float64)
-    distance, _ = _tree(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
+    distance, _ = few_queries(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
     return float(np.median(distance[:, 1]))
 
 
-def _tree(points: Array) -> cKDTree:
+def few_queries(points: npt.NDArray[np.floating]) -> cKDTree:
     """For a few queries: what makes many fast takes longer than they do."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
