@@ -133,11 +133,11 @@ def upright() -> list[Reading]:
     return read_photographs(case("normal").views.views, 1, lambda *_: None)
 
 
-@pytest.mark.parametrize("quarters", [(2, 2, 2), (0, 1, 3)])
+@pytest.mark.parametrize("quarters", [(2, 2, 2), (0, 1, 3), (0, 2, 0), (2, 2, 0)])
 def test_photographs_are_read_whichever_way_up_they_are(
     upright: list[Reading], quarters: tuple[int, ...]
 ) -> None:
-    """All from behind the patient's head; two that lost on which side they were taken."""
+    """All from behind the patient's head, or some; two that lost on which side they were taken."""
     turned = [
         replace(view, image=np.ascontiguousarray(np.rot90(view.image, k)))
         for view, k in zip(case("normal").views.views, quarters, strict=True)
