@@ -209,8 +209,13 @@ class Runner:
             self._fits.append(fit_arch(*args, **kwargs))
             return self._fits[-1]
 
-        def kept_reading(image: Any, valid: Any, name: str, **rest: Any) -> Reading:
-            made = self._reading(lambda: read_photograph(image, valid, name, **rest), image, valid)
+        def kept_reading(
+            image: Any, valid: Any, name: str, quarters: int = 0, **rest: Any
+        ) -> Reading:
+            def read() -> Reading:
+                return read_photograph(image, valid, name, quarters=quarters, **rest)
+
+            made = self._reading(read, image, valid, quarters)
             return replace(made, dentition=replace(made.dentition, name=name))
 
         with ExitStack() as stack:
@@ -218,9 +223,11 @@ class Runner:
             stack.enter_context(patch.object(reader, "read_photograph", kept_reading))
             yield
 
-    def _reading(self, read: Callable[[], Reading], image: Any, valid: Any) -> Reading:
+    def _reading(
+        self, read: Callable[[], Reading], image: Any, valid: Any, quarters: int
+    ) -> Reading:
         """A reading from the folder, or made and put there; the same either way."""
-        content = hashlib.sha256(self._code)
+        content = hashlib.sha256(self._code + bytes([quarters]))
         content.update(np.ascontiguousarray(image).tobytes())
         content.update(np.packbits(valid).tobytes())
         folder = self._readings / content.hexdigest()[:20]
