@@ -182,10 +182,15 @@ def held_labels(labels: Iterable[str], held_out: Sequence[str]) -> tuple[str, ..
         fitting = fitting or [label for label in labels if PurePath(label).stem == name]
         if len(fitting) != 1:
             problem = f"several ({', '.join(fitting[:3])})" if fitting else "none of them"
-            hint = nearest(name, [PurePath(label).stem for label in labels])
+            numbered = [label for label in labels if "#" in label]  # of a film or a sheet
+            plain = [PurePath(label).stem for label in labels if label not in numbered]
+            hint = nearest(name, plain)
+            how = "Give file names, with or without suffix"
+            if numbered:
+                how += f"; of what is in a film or a sheet with the number, as in {numbered[-1]}"
             raise RequestError(
                 f"views.held_out: of the {len(labels)} photographs given, '{name}' names "
-                f"{problem}.{hint} Give file names, with or without suffix."
+                f"{problem}.{hint} {how}."
             )
         found.add(fitting[0])
     return tuple(label for label in labels if label in found)

@@ -248,10 +248,18 @@ def test_bars_beside_a_film_are_cut_off(tmp_path: Path, turned: bool) -> None:
     assert {view.image.shape[:2] for view in whole.views} == {(160, 96) if turned else (96, 160)}
 
 
-def refused(folder: Path, path: Path) -> str:
+def refused(folder: Path, path: Path, **settings: Any) -> str:
     with pytest.raises(RequestError) as caught:
-        run_stage(folder, path)
+        run_stage(folder, path, **settings)
     return str(caught.value)
+
+
+def test_a_frame_to_hold_out_that_is_not_there(tmp_path: Path) -> None:
+    path = film(tmp_path / "x.mp4", count=8)
+    for name in ("x.mp4#99", "x", "y#3"):
+        message = refused(tmp_path / "out", path, held_out=(name,))
+        assert "as in x.mp4#7." in message
+        assert "Did you mean" not in message  # the film itself is no frame of it
 
 
 def test_broken_films(tmp_path: Path) -> None:
