@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 
 from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, opened, sort_of
+from pipeline.untrusted.films import KNOWN as KNOWN_FILMS
 from pipeline.untrusted.names import printable
 from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
 from stages.views.sampling import natural_key
@@ -21,6 +22,7 @@ IMAGE_SUFFIXES = (
 )  # fmt: skip
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
+    ".m2ts", ".ts",
 )  # fmt: skip
 MASK_PREFIX = "masks/"
 #: Names of folders with photographs, beside others with depth maps or masks.
@@ -212,8 +214,8 @@ def _expand(item: str | Path) -> list[Path]:
     if not is_photograph(path) and not is_video(path):
         raise RequestError(
             f"The file {printable(path.name)} is neither a photograph nor a video by its name "
-            f"('{path.suffix or 'no suffix'}'). Photographs are {KNOWN}; videos are MP4, "
-            "MOV, MKV, AVI or WebM. Convert it, or leave it out."
+            f"('{path.suffix or 'no suffix'}'). Photographs are {KNOWN}; videos are "
+            f"{KNOWN_FILMS}. Convert it, or leave it out."
         )
     return [path]
 

@@ -164,6 +164,8 @@ def test_the_folder_that_was_meant_is_named(tmp_path: Path) -> None:
 def test_a_video_is_alone(tmp_path: Path) -> None:
     video, other, image = touch(tmp_path, "x.MP4", "y.mov", "a.png")
     assert find_images([video]) == {"x.MP4": video}
+    for name in ("a.m2ts", "a.ts"):  # a camcorder's film, as it is called on a computer
+        assert list(find_images(touch(tmp_path, name))) == [name]
     assert "photographs" in refused([video, image])
     assert "other videos" in refused([video, other])
 
