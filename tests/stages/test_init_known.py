@@ -196,6 +196,17 @@ def test_lens_of_a_photograph_stored_on_its_side(lens_size):
     np.testing.assert_allclose(pixels, expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("parent", [".", "sparse"])
+def test_of_several_models_the_largest_is_taken(tmp_path, parent):
+    from tests.studies.comparison_scene import true_cameras, true_points, write_model
+
+    cameras = true_cameras()
+    for number, count in ((0, 2), (2, 3), (10, 2)):
+        write_model(tmp_path / parent / str(number), cameras[:count], true_points(30))
+    found, _ = read_cameras(model_files(tmp_path).values())
+    assert len(found) == 3
+
+
 def test_wrong_cameras_are_refused_in_words(tmp_path):
     with pytest.raises(RequestError, match=r"holds no cameras"):
         model_files(tmp_path)

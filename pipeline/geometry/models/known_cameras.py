@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -24,6 +25,8 @@ from pipeline.untrusted.scenes.transforms import read_transforms
 
 Array = npt.NDArray[np.float64]
 
+#: Folders of COLMAP's models; `isdigit` also takes digits that `int` doesn't.
+_NUMBER = re.compile(r"[0-9]{1,9}")
 COLMAP_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 #: What messages call the cameras where no setting is named.
 SETTING = "cameras"
@@ -50,8 +53,9 @@ def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
     """The files of a model: label -> file.
 
     Args:
-        path: a folder with a COLMAP model (text or binary; also with ``sparse/0`` or ``0`` in it),
-            a folder with a `transforms.json`, or such a file itself.
+        path: a folder with a COLMAP model (text or binary; also with ``sparse/0`` or ``0`` in it,
+            and of several such the one that holds most), a folder with a `transforms.json`, or such
+            a file itself.
         setting: name of the setting that gave the path, for messages.
 
     Raises:
@@ -62,21 +66,42 @@ def model_files(path: Path, setting: str = SETTING) -> dict[str, Path]:
         raise RequestError(f"{setting}: there is no {path.absolute()}. Check the path.")
     if path.is_file() and path.suffix.lower() == ".json":
         return {"cameras/transforms.json": path}
-    for folder in (path, path / "0", path / "sparse", path / "sparse" / "0"):
-        for suffix in (".bin", ".txt"):
-            found = {
-                f"cameras/{stem}{suffix}": folder / f"{stem}{suffix}"
-                for stem in COLMAP_FILES
-                if (folder / f"{stem}{suffix}").is_file()
-            }
-            if f"cameras/cameras{suffix}" in found and f"cameras/images{suffix}" in found:
-                return found
+    for folders in ([path], numbered(path), [path / "sparse"], numbered(path / "sparse")):
+        models = [model for model in map(_files_of_model, folders) if model]
+        if models:  # COLMAP's first model is not always its largest
+            return max(models, key=_bytes_of_images)
     if (path / "transforms.json").is_file():
         return {"cameras/transforms.json": path / "transforms.json"}
     raise RequestError(
         f"{setting}: {path} holds no cameras. Give a folder with a COLMAP model (cameras.bin "
         "and images.bin, or .txt), or a transforms.json as nerfstudio writes it."
     )
+
+
+def numbered(folder: Path) -> list[Path]:
+    """The folders 0, 1, 2, ... in which COLMAP leaves its models, in their order."""
+    try:
+        found = [entry for entry in folder.iterdir() if _NUMBER.fullmatch(entry.name)]
+    except OSError:  # no folder, or none that may be read
+        return []
+    return sorted(found, key=lambda entry: int(entry.name))
+
+
+def _files_of_model(folder: Path) -> dict[str, Path]:
+    """Label -> file of a COLMAP model; none if it is not whole."""
+    for suffix in (".bin", ".txt"):
+        found = {
+            f"cameras/{stem}{suffix}": folder / f"{stem}{suffix}"
+            for stem in COLMAP_FILES
+            if (folder / f"{stem}{suffix}").is_file()
+        }
+        if f"cameras/cameras{suffix}" in found and f"cameras/images{suffix}" in found:
+            return found
+    return {}
+
+
+def _bytes_of_images(model: dict[str, Path]) -> int:
+    return max(path.stat().st_size for path in model.values() if path.stem == "images")
 
 
 def read_cameras(files: Iterable[Path], setting: str = SETTING) -> tuple[list[KnownCamera], Scale]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,12 @@ from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import (
     matching_cameras,
     model_files,
+    numbered,
     pinhole_camera,
     read_cameras,
 )
 from pipeline.geometry.models.model_points import ModelPoints, read_model_points
 from pipeline.untrusted.paths import user_path
-
-#: Folders of COLMAP's models; `isdigit` also takes digits that `int` doesn't.
-_NUMBER = re.compile(r"[0-9]{1,9}")
 
 
 @dataclass(frozen=True)
@@ -46,11 +43,9 @@ def model_folders(path: Path) -> list[Path]:
     for parent in (path, path / "sparse"):
         if _is_model(parent):
             return [parent]
-        if parent.is_dir():
-            numbered = [entry for entry in parent.iterdir() if _NUMBER.fullmatch(entry.name)]
-            found = [entry for entry in numbered if _is_model(entry)]
-            if found:
-                return sorted(found, key=lambda entry: int(entry.name))
+        found = [entry for entry in numbered(parent) if _is_model(entry)]
+        if found:
+            return found
     return []
 
 
