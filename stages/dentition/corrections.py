@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -23,6 +24,7 @@ from stages.dentition.parts import perhaps_one
 
 Array = npt.NDArray[np.float64]
 
+SIDES = {"right": "left", "left": "right"}
 #: Why a photograph that the user leaves out is set aside.
 LEFT_OUT = "left out by hand"
 #: A line that leaves less than this share of a crown on one side doesn't part it.
@@ -226,3 +228,13 @@ def area(polygon: Array) -> float:
         return 0.0
     x, y = polygon.T
     return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
+
+
+def says_side(name: str) -> str:
+    """`right` or `left` where a file's name says one of them, "" otherwise.
+
+    A word or part of one in camel case: Wright and cleft say nothing.
+    """
+    begins = "(?<![A-Za-z])|(?<=[a-z])(?=[A-Z])"
+    said = [side for side in SIDES if re.search(f"(?:{begins})(?i:{side})", name)]
+    return said[0] if len(said) == 1 else ""

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
-from stages.dentition.corrections import area
+from stages.dentition.corrections import SIDES, area, says_side
 from stages.teeth.read import Reading, row_extent
 
 Array32 = npt.NDArray[np.float32]
@@ -134,6 +134,8 @@ def _repeated(
                 break
             if other in result or likely(readings[k]) != likely(readings[other]):
                 continue
+            if SIDES.get(says_side(names[k])) == says_side(names[other]) != "":
+                continue  # one is a mirror image, and of another side
             off = layout_distance(readings[k].dentition, readings[other].dentition)
             if off is not None and off < options.same_view:
                 result[k] = f"it shows the same as {names[other]}, which is clearer"

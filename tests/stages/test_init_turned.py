@@ -10,8 +10,9 @@ import pytest
 
 from pipeline.artifacts.teeth import Crown, Dentition
 from pipeline.artifacts.views import View
+from stages.dentition.corrections import says_side
 from stages.dentition.crowns import mirrored_dentition
-from stages.init.dental.mirror_images import Turned, fit_turned, says_side, turnings
+from stages.init.dental.mirror_images import Turned, fit_turned, turnings
 from stages.init.dental.solution import ArchFit, PlacedView
 
 WIDTH, HEIGHT = 60, 20

@@ -45,9 +45,11 @@ def picture(sharp: float = 0.05, colour: float = 0.2, seed: int = 0) -> np.ndarr
     return np.clip(grey + tint, 0, 1).astype(np.float32)
 
 
-def reasons(*readings: Reading, images: list[np.ndarray] | None = None) -> list[str]:
+def reasons(
+    *readings: Reading, images: list[np.ndarray] | None = None, names: list[str] | None = None
+) -> list[str]:
     pictures = images or [picture()] * len(readings)
-    names = [f"p{k}.jpg" for k in range(len(readings))]
+    names = names or [f"p{k}.jpg" for k in range(len(readings))]
     chosen = choose(readings, pictures, names, ChoiceOptions())
     for before, after in zip(readings, chosen, strict=True):
         assert replace(after, set_aside="") == before.dentition
@@ -120,6 +122,16 @@ def test_of_two_that_show_the_same_the_clearer_one_is_kept() -> None:
 
 def test_other_views_of_the_same_teeth_are_both_kept() -> None:
     assert reasons(reading(dentition()), reading(dentition(stretch=0.3), "left")) == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("names", "kept"),
+    [("right left", 2), ("left right", 2), ("right right2", 1), ("right 2", 1), ("1 2", 1)],
+)
+def test_sides_by_name_are_not_the_same_whatever_they_look_like(names: str, kept: int) -> None:
+    """The mirror image of one side looks like the other."""
+    pair = [reading(dentition(), "left"), reading(dentition(degrees=3.0), "left")]
+    assert reasons(*pair, names=names.split()).count("") == kept
 
 
 def test_a_photograph_that_is_no_use_pushes_no_other_aside() -> None:

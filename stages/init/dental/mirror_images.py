@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.artifacts.teeth import Dentition
 from pipeline.artifacts.views import View
+from stages.dentition.corrections import SIDES, says_side
 from stages.dentition.crowns import mirrored_dentition
 from stages.dentition.tooth_rows import number_is_said
 from stages.init.dental.solution import ArchFit
 
 #: Places the photographs, with their teeth.
 Fit = Callable[[list[View], list[Dentition | None]], ArchFit]
-SIDES = {"right": "left", "left": "right"}
 #: Of so many photographs at least one from the front may be turned back. Of 24 pairs of it and one
 #: side (twelve patients) two look as if it were a mirror image, and pass, turned over, with numbers
 #: that are wrong.
@@ -96,13 +95,3 @@ def _is_said(dentition: Dentition) -> bool:
     """Has a person said how the photograph shows the patient's sides?"""
     numbered = any(map(number_is_said, dentition.all_crowns))
     return dentition.mirrored is not None or numbered
-
-
-def says_side(name: str) -> str:
-    """`right` or `left` where a file's name says one of them, "" otherwise.
-
-    A word or part of one in camel case: Wright and cleft say nothing.
-    """
-    begins = "(?<![A-Za-z])|(?<=[a-z])(?=[A-Z])"
-    said = [side for side in SIDES if re.search(f"(?:{begins})(?i:{side})", name)]
-    return said[0] if len(said) == 1 else ""

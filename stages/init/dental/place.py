@@ -17,8 +17,8 @@ from pipeline.artifacts.teeth import Teeth as TeethArtifact
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
+from stages.dentition.corrections import SIDES, says_side
 from stages.init.config import DentalConfig, InitConfig
-from stages.init.dental.mirror_images import SIDES, says_side
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.read import labelled_teeth, set_aside_reasons, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
