@@ -18,7 +18,11 @@ class TeethConfig(StageConfig):
         "and leave scenes alone of which a few show no teeth",
     )
     most_views: int = Field(
-        12, ge=1, le=1000, description="of more photographs than this, auto reads so many, evenly"
+        12,
+        ge=1,
+        le=1000,
+        description="of more photographs than this, auto reads so many, evenly; and of as many "
+        "others, if some of these show no teeth, those that do",
     )
     set_aside: bool = Field(
         True,

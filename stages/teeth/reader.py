@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from itertools import compress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,9 +25,9 @@ Item = TypeVar("Item")
 Progress = Callable[[str, int, int], None]
 Map = Callable[[Callable[..., Any], Iterable[Any]], Iterable[Any]]
 
-#: So many photographs, evenly chosen, are asked whether a case is one of teeth at all; more than
-#: this share must show them.
-_ASKED, _SHARE = 3, 0.3
+#: A case is one of teeth if more than this share of so many photographs, evenly chosen, show them;
+#: or so many of all: in a clinic's folder faces and X-rays may be more.
+_ASKED, _SHARE, _SHOWING = 3, 0.3, 2
 #: Share of a photograph that is tooth, and crowns in it, to show teeth.
 _LEAST_TOOTH, _LEAST_CROWNS = 0.015, 6
 #: Score of a crown at the first look that counts for that, and the share of all crowns that must
@@ -54,23 +55,39 @@ class PhotographReader:
         self._threads = max(1, threads)
         self._glances = [Glances(view.image, view.valid()) for view in views]
 
-    def shows_teeth(self) -> bool:
-        """Is this a case of teeth? One quick look at a few photographs."""
-        with self._side_by_side() as map_:
-            votes = list(map_(_has_teeth, evenly(self._glances, _ASKED)))
-        return bool(votes) and sum(votes) > _SHARE * len(votes)
+    def worth_reading(self, spare: Collection[int] = ()) -> list[int]:
+        """Places of the photographs to read: those that are not spare, and spare ones that show
+        teeth if some of these show none. Nothing where this is no case of teeth.
+        """
+        first = [k for k in range(len(self._views)) if k not in spare]
+        asked = evenly(first, _ASKED)
+        sure = sum(self._show_teeth(asked)) > _SHARE * len(asked)
+        showing = self._show_teeth(first)
+        more: list[int] = []
+        if any(showing) and not all(showing):
+            more = [*compress(spare, self._show_teeth(spare))]
+        return sorted([*first, *more]) if sure or sum(showing) + len(more) >= _SHOWING else []
 
-    def read(self, progress: Progress) -> list[Reading]:
-        """Read every photograph.
+    def _show_teeth(self, places: Iterable[int]) -> list[bool]:
+        """Do photographs show teeth? A quick look at each."""
+        with self._side_by_side() as map_:
+            return list(map_(_has_teeth, [self._glances[k] for k in places]))
+
+    def read(self, progress: Progress, places: Sequence[int] | None = None) -> list[Reading]:
+        """Read the photographs at some places (None: all).
 
         Photographs are turned the right way up where that is clear, each by itself or else with
         the others; frames of a film together. The outlines remain those of the photographs.
         """
-        numbers = range(len(self._views))
+        numbers = range(len(self._views)) if places is None else places
         progress("reading teeth", 0, len(numbers))
         with self._side_by_side() as map_:
-            first = map_(lambda glances: glances.turned(0)[1], self._glances)
-            both = [number for number, crowns in enumerate(first) if shows_both_rows(crowns)]
+            first = map_(lambda number: self._glances[number].turned(0)[1], numbers)
+            both = [
+                number
+                for number, crowns in zip(numbers, first, strict=True)
+                if shows_both_rows(crowns)
+            ]
             frames = [number for number in both if self._views[number].timestamp is not None]
             asked = sorted({*both} - {*frames} | {*evenly(frames, _FRAMES)})
             # what a photograph looks like on its head is seen while others are read
@@ -78,22 +95,20 @@ class PhotographReader:
                 *(partial(self._read, number) for number in numbers),
                 *(partial(_gain_upside_down, self._glances[number]) for number in asked),
             ]
-            readings, gains = [], []
+            made, gains = [], []
             for done, result in enumerate(map_(lambda task: task(), tasks), 1):
                 if isinstance(result, Reading):
-                    readings.append(result)
+                    made.append(result)
                     progress("reading teeth", done, len(numbers))
                 else:
                     gains.append(result)
-            over = self._on_their_heads(dict(zip(asked, gains, strict=True)))
-            for number, reading in zip(
-                over, map_(partial(self._read, quarters=2), over), strict=True
-            ):
-                readings[number] = reading
-        return readings
+            readings = dict(zip(numbers, made, strict=True))
+            over = self._on_their_heads(numbers, dict(zip(asked, gains, strict=True)))
+            readings |= zip(over, map_(partial(self._read, quarters=2), over), strict=True)
+        return [readings[number] for number in numbers]
 
-    def _on_their_heads(self, gains: dict[int, float | None]) -> list[int]:
-        """The photographs to turn over, by what some of them gain by that, where it is known."""
+    def _on_their_heads(self, numbers: Sequence[int], gains: dict[int, float | None]) -> list[int]:
+        """Those to turn over of some photographs, by what such as were asked gain by that."""
         known = {number: gain for number, gain in gains.items() if gain is not None}
         if not known:
             return []
@@ -104,7 +119,7 @@ class PhotographReader:
             clear = abs(own) > _MORE_UPRIGHT and self._views[number].timestamp is None
             return own if clear else every
 
-        return [number for number in range(len(self._views)) if gain(number) > _MORE_UPRIGHT]
+        return [number for number in numbers if gain(number) > _MORE_UPRIGHT]
 
     def _read(self, number: int, quarters: int = 0) -> Reading:
         view = self._views[number]

@@ -42,23 +42,29 @@ class TeethStage(Stage):
         config: TeethConfig = context.config
         views = context.load("views").views
         found = [Dentition(view.name, (view.width, view.height), UNREAD) for view in views]
-        read = list(range(len(views)))
+        every = list(range(len(views) if config.method != "none" else 0))
+        first, spare = every, set[int]()
         if config.method == "auto":  # neighbours in a film show the same teeth
-            read = evenly(read, config.most_views)
-        working = [working_view(views[k]) for k in read]
+            first = evenly(every, config.most_views)
+            spare = {*evenly([k for k in every if k not in first], config.most_views)}
+        asked = sorted({*first, *spare})
+        working = [working_view(views[k]) for k in asked]
         reader = PhotographReader(working, context.threads)
-        wanted = config.method == "reader" or (config.method == "auto" and reader.shows_teeth())
-        if not wanted:
+        places = list(range(len(asked)))
+        if config.method == "auto":
+            places = reader.worth_reading([k for k in places if asked[k] in spare])
+        if not places:
             context.save(Teeth(tuple(found)))
             context.summarize(photographs_with_teeth=0)
             return
-        readings = reader.read(context.progress)
+        readings = reader.read(context.progress, places)
+        read = [asked[place] for place in places]
         options = ChoiceOptions(
             config.least_crowns, config.least_extent, config.least_colour, config.same_view,
             config.least_score,
         )  # fmt: skip
         names = [views[k].source_name or views[k].name for k in read]
-        images = [view.image for view in working]
+        images = [working[place].image for place in places]
         chosen = (
             choose(readings, images, names, options)
             if config.set_aside

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,15 +33,16 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         def __init__(self, views: list[View], threads: int) -> None:
             self.views = views
 
-        def shows_teeth(self) -> bool:
-            return True
+        def worth_reading(self, spare: Collection[int]) -> list[int]:
+            return [k for k in range(len(self.views)) if k not in spare]
 
-        def read(self, progress: Callable[..., None]) -> list[Reading]:
-            names.extend(view.name for view in self.views)
+        def read(self, progress: Callable[..., None], places: list[int]) -> list[Reading]:
+            read = [self.views[k] for k in places]
+            names.extend(view.name for view in read)
             kinds = {"upper": 0.0, "lower": 0.0, "other": 1.0}
             return [
                 Reading(Dentition(view.name, (view.width, view.height), "other"), kinds, 0.0)
-                for view in self.views
+                for view in read
             ]
 
     monkeypatch.setattr("stages.teeth.reader.PhotographReader", Reader)
@@ -107,4 +108,31 @@ def test_what_repeats_is_not_yet_teeth(
     glances = SimpleNamespace(turned=lambda quarters: (answer, crowns))
     monkeypatch.setattr(reader, "Glances", lambda image, valid: glances)
     view = View("000", np.full((24, 32, 3), 0.5, np.float32))
-    assert PhotographReader([view], 1).shows_teeth() is shows
+    assert PhotographReader([view], 1).worth_reading() == [0] * shows
+
+
+@pytest.mark.parametrize(
+    ("showing", "spare", "read"),
+    [
+        ("111111", "", "012345"),
+        ("000000", "", ""),
+        ("100000", "", "012345"),  # a third of the three asked show them
+        ("010000", "", ""),
+        ("010010", "", "012345"),
+        ("000100", "", ""),
+        ("111111", "135", "024"),  # a film: neighbours show the same
+        ("110111", "135", "012345"),
+        ("011111", "135", "012345"),
+        ("010100", "135", ""),  # nothing hints at teeth
+        ("010010", "135", "0124"),
+        ("000010", "135", "024"),
+    ],
+)
+def test_what_of_a_clinics_folder_is_worth_reading(
+    showing: str, spare: str, read: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "Glances", lambda image, valid: float(image[0, 0, 0]))
+    monkeypatch.setattr(reader, "_has_teeth", lambda shows: shows > 0)
+    views = [View("x", np.full((2, 2, 3), int(shows), np.float32)) for shows in showing]
+    found = PhotographReader(views, 1).worth_reading([int(k) for k in spare])
+    assert "".join(map(str, found)) == read
