@@ -101,8 +101,16 @@ def everything(image: Floats, rng: Rng) -> Altered:
     return image, change
 
 
+def over(image: Floats, rng: Rng) -> Altered:
+    """Each upside down or not, by the toss of a coin: a phone held flat can't tell."""
+    height, width = image.shape[:2]
+    if rng.random() < 0.5:
+        return image, np.eye(2, 3)
+    return image[::-1, ::-1], np.array([[-1.0, 0, width], [0, -1, height]])
+
+
 SORTS: dict[str, Callable[[Floats, Rng], Altered]] = {
-    made.__name__: made for made in (balance, exposure, turned, cut, small, soft, everything)
+    made.__name__: made for made in (balance, exposure, turned, cut, small, soft, everything, over)
 }
 
 
