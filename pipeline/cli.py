@@ -336,7 +336,7 @@ def main() -> NoReturn:
 def command_line() -> int:
     """Run the command line; every outcome has its exit status (docs/first_case.md)."""
     let_streams_show_all()
-    completion.mend_words()
+    completion.suit_shell()
     debug = "--debug" in sys.argv
     try:
         status = app(standalone_mode=False)

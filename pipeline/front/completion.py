@@ -10,12 +10,16 @@ from collections.abc import Iterator
 _before = ""
 
 
-def mend_words() -> None:
-    """To bash ``--set fit.light=no`` is four words, and it asks for the last of them alone.
+def suit_shell() -> None:
+    """Ask and answer as the shells mean it.
 
-    Put together what belongs together, and remember what stands before the part that is asked for.
+    To fish each line is an answer: meanings must not wrap. To bash ``--set fit.light=no`` is four
+    words, and it asks for the last of them alone: put together what belongs together, and remember
+    what stands before the part that is asked for.
     """
     global _before
+    if "_TYPER_COMPLETE_ARGS" in os.environ:
+        os.environ["COLUMNS"] = "9999"
     given = os.environ.get("COMP_WORDS", "").split("\n")
     if "=" not in given:
         return

@@ -49,15 +49,28 @@ def test_settings() -> None:
     ],
 )
 def test_bash_is_answered(words: str, answer: list[str]) -> None:
-    """As it asks: the program itself, with the line in its environment, apart at each ``=``."""
+    """Its line is apart at each ``=``."""
     given = words.split()
+    asked = {"COMP_WORDS": "\n".join(given), "COMP_CWORD": str(len(given) - 1)}
+    assert told("bash", **asked).split()[: len(answer)] == answer
+
+
+def test_fish_and_zsh_are_answered() -> None:
     asked = {
-        "_PIPELINE_COMPLETE": "complete_bash",
-        "COMP_WORDS": "\n".join(given), "COMP_CWORD": str(len(given) - 1),
+        "_TYPER_COMPLETE_ARGS": "pipeline run --set fit.light", "COLUMNS": "40",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
     }  # fmt: skip
+    lines = told("fish", **asked).splitlines()
+    assert lines[0].startswith("fit.light=\ta light beside the lens") and len(lines) > 5
+    assert all("\t" in line for line in lines), "each line is an answer"
+    assert '("fit.light=":"a light beside the lens' in told("zsh", **asked)
+
+
+def told(shell: str, **asked: str) -> str:
+    """What the program answers a shell that asks by its environment."""
     code = "import sys; sys.argv[0] = 'pipeline'; from pipeline.cli import main; main()"
-    told = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-    assert told.stdout.split()[: len(answer)] == answer, told.stderr
+    environment = {**os.environ, **asked, "_PIPELINE_COMPLETE": f"complete_{shell}"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    return done.stdout
