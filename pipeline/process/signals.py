@@ -33,6 +33,8 @@ PATIENCE = 5.0
 #: Seconds after which a process that can't obey (native code that takes its time) is ended.
 LAST_RESORT = 20.0
 
+#: To a terminal: what a display that nobody stops any more leaves is wiped, and its cursor is back.
+SHOWN_AGAIN = "\r\x1b[K\x1b[?25h"
 TEXT = "Interrupted. Run the same command again to go on from here."
 
 _asked_at: float | None = None
@@ -89,8 +91,9 @@ def _end_if_stuck(heard: int) -> None:
 
 def end() -> NoReturn:
     """End this process now as an interrupted one: no library gets to say anything any more."""
+    shown = os.isatty(2) and os.environ.get("TERM", "dumb") != "dumb"
     with contextlib.suppress(OSError):
-        os.write(2, f"{TEXT}\n".encode())
+        os.write(2, f"{SHOWN_AGAIN if shown else ''}{TEXT}\n".encode())
     os._exit(STATUS)
 
 

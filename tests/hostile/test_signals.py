@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
@@ -212,6 +213,32 @@ ctypes.CDLL(None).system(b'sleep 2')
         process.wait(timeout=10)
         assert time.monotonic() - begin < 1.5
         assert process.returncode == 130
+
+
+def test_a_terminal_has_its_cursor_back_after_a_forced_end() -> None:
+    body = """
+import ctypes
+from pipeline.front.progress import LiveReporter
+signals.LAST_RESORT = 0.3
+LiveReporter().start([])
+ctypes.CDLL(None).system(b'sleep 9')
+"""
+    import pty  # POSIX's
+
+    main, terminal = pty.openpty()
+    process = subprocess.Popen(
+        script(body), cwd=ROOT, stderr=terminal, stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "TERM": "xterm"},
+    )  # fmt: skip
+    os.close(terminal)
+    told = b""
+    with contextlib.suppress(OSError):  # EIO: nobody has the terminal any more
+        while more := os.read(main, 9999):
+            told += more
+            if b"\x1b[?25l" in more:
+                process.terminate()
+    assert process.wait(timeout=10) == 130
+    assert told.count(b"\x1b[?25l") == told.count(b"\x1b[?25h") == 1
 
 
 LOST = {
