@@ -49,7 +49,9 @@ def file_in_the_way(error: BaseException, below: Path | None = None) -> RequestE
     known = (*_IN_THE_WAY, errno.ENOENT) if below is not None else _IN_THE_WAY
     if error.errno not in known:
         return None
-    path = Path(error.filename)
+    # of a rename it is the target that is in the way, of a temporary file its folder
+    path = Path(error.filename2 if isinstance(error.filename2, str) else error.filename)
+    path = path.parent if path.suffix == ".tmp" else path
     if below is not None and not Path(os.path.abspath(path)).is_relative_to(  # noqa: PTH100
         os.path.abspath(below)  # noqa: PTH100
     ):

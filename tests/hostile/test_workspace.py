@@ -17,7 +17,8 @@ from toy import artifact_bytes
 import pipeline
 from pipeline.cli import app
 from pipeline.errors import PipelineError
-from pipeline.store import Store
+from pipeline.files import write_atomic
+from pipeline.store import Store, file_in_the_way
 
 RAN = {"read": "ran", "scale": "ran", "count": "ran", "publish": "ran"}
 CACHED = dict.fromkeys(RAN, "cached")
@@ -307,6 +308,15 @@ def test_a_folder_that_vanishes_or_closes_ends_with_the_remedy(
         with pytest.raises(pipeline.RequestError, match=r"can't be used \(Permission denied\)"):
             run(QUIET)
     assert run(QUIET) == RAN | {"read": "cached"}
+
+
+def test_what_is_in_the_way_is_named_and_no_temporary_file(tmp_path: Path) -> None:
+    (tmp_path / "current.json").mkdir()
+    (tmp_path / "scale").touch()
+    for path, named in (("current.json", "current.json"), ("scale/.owner.json", "scale")):
+        with pytest.raises(OSError) as refused:
+            write_atomic(tmp_path / path, "")
+        assert str(file_in_the_way(refused.value)).startswith(f"{tmp_path / named} can't be used")
 
 
 # -- clean -----------------------------------------------------------------------------------------
