@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -361,7 +362,8 @@ def _fail(error: BaseException, status: int, debug: bool) -> int:
         traceback.print_exception(error)
     print(f"\n{error}", file=sys.stderr)
     if "--json" in sys.argv:
-        print(json.dumps({"error": str(error), "exit_status": status}))
+        with contextlib.suppress(OSError):  # it may be what could not be written to
+            print(json.dumps({"error": str(error), "exit_status": status}))
     return status
 
 

@@ -125,6 +125,7 @@ def run(command: Callable[[], int]) -> NoReturn:
     whose import was interrupted raises anything.
     """
     try:
+        _open_closed_streams()
         install()
         status = command()
         for number in ENDING:  # the status is known: a signal has nothing to add
@@ -140,6 +141,15 @@ def run(command: Callable[[], int]) -> NoReturn:
             sys.stdout.flush()
         end()
     _leave(status)
+
+
+def _open_closed_streams() -> None:
+    """Where a stream was closed by who started this, the next file opened would be taken for it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            opened = os.open(os.devnull, os.O_RDWR)  # it gets the lowest number that is free
+            os.set_inheritable(opened, True)
+            setattr(sys, name, os.fdopen(opened, "w" if number else "r", encoding="utf-8"))
 
 
 def _leave(status: int) -> NoReturn:

@@ -215,6 +215,17 @@ ctypes.CDLL(None).system(b'sleep 2')
         assert process.returncode == 130
 
 
+def test_a_run_whose_streams_are_closed_ends_well(toys: Path) -> None:
+    """Nor does a library write into the file that would have got the number of a stream."""
+    for closed in ((2,), (0, 1, 2)):
+        done = subprocess.run(
+            [sys.executable, str(TOY), *RUN, "--set", f"scale.factor={1 + len(closed)}"], cwd=toys,
+            env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL,
+            preexec_fn=lambda closed=closed: [os.close(number) for number in closed],
+        )  # fmt: skip
+        assert done.returncode == 0
+
+
 def test_a_terminal_has_its_cursor_back_after_a_forced_end() -> None:
     body = """
 import ctypes

@@ -57,6 +57,20 @@ def test_json_is_json(toys: Path) -> None:
     assert json.loads(wrong.stdout)["exit_status"] == 2
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_an_answer_that_finds_no_room_is_said_in_words(toys: Path, more: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command(*RUN, "--dry-run", *more),
+            cwd=toys,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
 def test_status_tells_why(toys: Path) -> None:
     call(toys, *RUN)
     done = call(toys, "status", "-w", "w", "--set", "scale.factor=3")
