@@ -132,6 +132,10 @@ def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise RequestError(f"The preset {path} must be a mapping with a section per stage.")
     base = tree.pop("extends", None)
+    stages = usable_stages()
+    tree |= {
+        n: _section(stages[n].Config, tree[n], path.parent) for n in tree.keys() & stages.keys()
+    }
     if base is None:
         return tree
     return _merge(_read_preset(str(base), (*seen, path)), tree)
@@ -213,11 +217,24 @@ def anchored(change: str, begin: str | Path = "") -> str:
         return change
     if type(value) in (int, float):  # a folder may be called 2024
         value = text.strip()
+    whole = _whole(field, value, begin)
+    return change if whole == value else f"{name}={yaml_value(whole)}"
+
+
+def _whole(field: FieldInfo | None, value: Any, begin: str | Path) -> Any:
+    """The value of a setting; where that is a path, all of it."""
+    if isinstance(value, dict) and field is not None:
+        return _section(model_in(field.annotation), value, begin)
     if field is None or not names_path(field) or not isinstance(value, str):
-        return change
-    if not value or value.startswith("~"):
-        return change
-    return f"{name}={yaml_value(os.path.abspath(Path(begin, value)))}"  # noqa: PTH100
+        return value
+    return value if value[:1] in ("", "~") else os.path.abspath(Path(begin, value))  # noqa: PTH100
+
+
+def _section(model: type[BaseModel] | None, values: Any, begin: str | Path) -> Any:
+    """The values of a model, paths in whole."""
+    if model is None or not isinstance(values, dict):
+        return values
+    return {n: _whole(model.model_fields.get(n), value, begin) for n, value in values.items()}
 
 
 def yaml_value(value: Any) -> str:

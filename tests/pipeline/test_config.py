@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -148,3 +149,15 @@ def test_the_place_of_a_file_is_not_in_the_key() -> None:
 def test_settings_that_do_not_go_together_are_refused_in_our_words() -> None:
     with pytest.raises(RequestError, match="is not allowed: isotropic works with"):
         load_config(overrides=["fit.isotropic=true"])
+
+
+def test_paths_of_a_preset_begin_at_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "a.yaml").write_text("extends: dentalsplat\nviews: {masks: m}\n")
+    (tmp_path / "b.yaml").write_text(
+        "extends: base/a.yaml\ninit: {cameras: ~/c, pointmap: {files: p}}\nfit: {iterations: 5}\n"
+    )
+    sections: Any = load_config(tmp_path / "b.yaml").sections
+    assert sections["views"].masks == tmp_path / "base" / "m"
+    assert sections["init"].pointmap.files == str(tmp_path / "p")
+    assert (sections["init"].cameras, sections["fit"].iterations) == ("~/c", 5)
