@@ -67,6 +67,13 @@ class Camera:
         pixels[:, 1] = v / safe * self.fy + self.cy
         return pixels, depth
 
+    def shows(
+        self, pixels: npt.NDArray[np.floating], depths: npt.NDArray[np.floating]
+    ) -> npt.NDArray[np.bool_]:
+        """Which projected places, pixels [..., 2] and depths [...], are ahead and in its image."""
+        within = (pixels >= 0).all(-1) & (pixels < (self.width, self.height)).all(-1)
+        return np.asarray(within & (depths > 0))
+
     def unproject(self, depth: npt.NDArray[np.floating]) -> Array:
         """Lift a depth map [H, W] (z, not ray length) to world points [H, W, 3]."""
         height, width = depth.shape

@@ -52,8 +52,7 @@ def sparse_points(
     for image, camera in zip(images, cameras, strict=True):
         pixels, depth = camera.project(positions)
         column, row = np.floor(pixels).astype(np.int64).T
-        inside = (depth > 0) & (column >= 0) & (row >= 0)
-        inside &= (column < camera.width) & (row < camera.height)
+        inside = camera.shows(pixels, depth)
         colors[inside] += image[row[inside], column[inside]]
         count[inside] += 1
         towards = camera.centre - positions

@@ -33,9 +33,7 @@ def observations(
     found = []
     for camera, depth_map in zip(cameras, depths, strict=True):
         pixels, depth = camera.project(points)
-        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        inside &= depth > 0
-        index = np.flatnonzero(inside)
+        index = np.flatnonzero(camera.shows(pixels, depth))
         column, row = pixels[index].astype(np.int64).T
         surface = depth_map[row, column]
         with np.errstate(invalid="ignore"):

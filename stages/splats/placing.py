@@ -76,6 +76,5 @@ def share_in_view(gaussians: Gaussians, cameras: Sequence[Camera]) -> float:
     seen = np.zeros(len(gaussians), bool)
     for camera in cameras:
         pixels, depth = camera.project(gaussians.means)
-        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        seen |= inside & (depth > 0)
+        seen |= camera.shows(pixels, depth)
     return float(seen.mean())

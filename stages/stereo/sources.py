@@ -15,7 +15,7 @@ def visible_points(camera: Camera, points: Array) -> tuple[Array, Array]:
     if len(points) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     pixels, depth = camera.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    inside = camera.shows(pixels, depth)
     return points[inside], depth[inside]
 
 

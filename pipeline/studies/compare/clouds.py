@@ -74,11 +74,10 @@ def read_surface(path: Path, cameras: Sequence[Camera]) -> Surface:
 def _looked_up(depth: Array, camera: Camera, points: Array) -> Array:
     """[N] depth map's value where points [N, 3] project to, 0 outside."""
     pixels, away = camera.project(points)
-    column, row = np.floor(np.clip(pixels, -1, 1e6)).astype(np.int64).T
-    inside = (away > 0) & (column >= 0) & (row >= 0)
-    inside &= (column < camera.width) & (row < camera.height)
+    inside = camera.shows(pixels, away)
+    column, row = pixels[inside].astype(np.int64).T
     value = np.zeros(len(points))
-    value[inside] = depth[row[inside], column[inside]]
+    value[inside] = depth[row, column]
     return value
 
 

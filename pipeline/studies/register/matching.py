@@ -179,9 +179,7 @@ def spots_between(
     known = a.look.depth > 0
     pixels, z = camera.project(moved.reshape(-1, 3))
     pixels, z = pixels.reshape(height, width, 2), z.reshape(height, width)
-    inside = (
-        known & (z > 1) & (pixels >= 0).all(-1) & (pixels < (camera.width, camera.height)).all(-1)
-    )
+    inside = known & (z > 1) & camera.shows(pixels, z)
     x, y = np.moveaxis((pixels - 0.5).astype(np.float32), -1, 0)
     laid = cv2.remap(b.contrast, x, y, cv2.INTER_LINEAR)
     # Outlines, gum and highlights move in ways of their own: only what both photographs show well

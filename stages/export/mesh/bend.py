@@ -38,9 +38,7 @@ def bent(
     said = np.full((len(cameras), len(places)), np.nan)
     for row, camera, depth in zip(said, cameras, depths, strict=True):
         pixels, z = camera.project(places)
-        index = np.flatnonzero(
-            (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (z > 0)
-        )
+        index = np.flatnonzero(camera.shows(pixels, z))
         column, line = pixels[index].astype(np.int64).T
         surface, z = depth[line, column], z[index]
         ray = places[index] - camera.centre

@@ -79,10 +79,7 @@ def choose_frame(positions: Array, cameras: Sequence[Camera]) -> Frame:
     depths = []
     for camera in cameras:
         pixels, depth = camera.project(sample)
-        inside = (
-            (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        )
-        depths.append(depth[inside])
+        depths.append(depth[camera.shows(pixels, depth)])
     every = np.concatenate(depths)
     scale = float(np.median(every)) if len(every) else 1.0
     return Frame(np.median(positions, axis=0), scale if scale > 0 else 1.0)
@@ -158,9 +155,7 @@ def facing(positions: Array, normals: Array, cameras: Sequence[Camera]) -> Array
     total, mass = np.zeros(len(positions)), np.zeros(len(positions))
     for camera in cameras:
         pixels, depth = camera.project(positions)
-        inside = (
-            (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        )
+        inside = camera.shows(pixels, depth)
         towards = camera.centre - positions
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = np.clip((towards * normals).sum(1), 0, 1) * inside

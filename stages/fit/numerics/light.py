@@ -50,7 +50,7 @@ def sighted(
     column = np.clip(np.floor(pixels[:, 0]), 0, camera.width - 1).astype(np.int64)
     row = np.clip(np.floor(pixels[:, 1]), 0, camera.height - 1).astype(np.int64)
     front = point_depth(surface, camera, camera.width, camera.height)[row, column]
-    seen = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depth > 0)
+    seen = camera.shows(pixels, depth)
     seen &= mask[row, column] & (front > 0) & (np.abs(depth - front) < tolerance * depth)
     return row, column, seen
 

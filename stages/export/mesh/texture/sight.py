@@ -53,7 +53,7 @@ def _sight(mesh: Mesh, area: Array, camera: Camera, mask: Bools) -> Sight:
     pixels, depths = camera.project(mesh.vertices)
     nearest = np.zeros((camera.height, camera.width), np.float32)
     draw(pixels, depths, depths, mesh.faces, nearest, np.zeros_like(nearest))
-    inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
+    inside = camera.shows(pixels, depths)
     column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
     seen = inside & mask[row, column] & (depths * nearest[row, column] < 1 + BEHIND)
     a, b, c = (pixels[mesh.faces[:, k]] for k in range(3))
