@@ -73,7 +73,7 @@ def table(counts: list[int], threads: list[int], repetitions: int) -> None:
     print("".join(f"{head:>16}" for head in heads))
     for count in counts:
         packed = scene(count)
-        adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
+        adam = Adam(packed.shape)
         still = np.zeros(packed.shape[1], np.float32)
         for number in threads:
             use_threads(number)
@@ -102,7 +102,7 @@ def memory(count: int) -> None:
     before = peak_memory()
     packed = scene(count, sigma_px=1.5)
     rendering: Rendering | None = None
-    adam = Adam(packed.shape, 0.9, 0.999, 1e-15)
+    adam = Adam(packed.shape)
     target = np.zeros((3, 2 * HEIGHT, 2 * WIDTH), np.float32)
     loss = ColourLoss(target, np.ones((2 * HEIGHT, 2 * WIDTH), np.float32))
     for _ in range(2):

@@ -19,9 +19,6 @@ Array = npt.NDArray[np.float32]
 
 #: Sum of the three channels by which views may differ in the colour of the same surface.
 _ALIKE = np.float32(0.3)
-#: Views that are asked about a depth map: those nearest. With more, asking all would take time that
-#: grows with the square of their number.
-MOST_ASKED = 11
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,7 @@ def fuse(
         for v, camera in enumerate(cameras):
             shape = depths[v].shape
             seen = camera.unproject(depths[v])[confidences[v] > 1]
-            others = nearest_views(v, list(cameras), seen, MOST_ASKED)
+            others = nearest_views(v, list(cameras), seen)
             keep = np.zeros(shape, np.uint8)
             depth = np.zeros(shape, np.float32)
             color = np.zeros((*shape, 3), np.float32)

@@ -84,7 +84,7 @@ class Trainer:
         self.lit, self.scene, self.cloud = lit, scene, cloud
         self.poses, self.focal = PoseOptimizer(poses, held), SharedFocal()
         self.parts = [part for kind in PARTS if (part := kind.of(self)) is not None]
-        self.adam = Adam(self.packed.shape, 0.9, 0.999, 1e-15)
+        self.adam = Adam(self.packed.shape)
         self.rasterize: Callable[..., Any] = rasterize
         self.random = np.random.Generator(np.random.PCG64(self.settings.seed))
         self.views = list(range(len(self.targets)))

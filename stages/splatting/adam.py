@@ -10,6 +10,8 @@ from stages.splatting.threads import KERNELS
 
 Floats = npt.NDArray[np.float32]
 F = np.float32
+#: How fast the moments forget, and what keeps a step finite.
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 class Adam:
@@ -20,20 +22,19 @@ class Adam:
         steps: steps taken.
     """
 
-    def __init__(self, shape: tuple[int, int], beta1: float, beta2: float, epsilon: float) -> None:
+    def __init__(self, shape: tuple[int, int]) -> None:
         self.first: Floats = np.zeros(shape, np.float32)
         self.second: Floats = np.zeros(shape, np.float32)
         self.steps = 0
-        self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
 
     def step(self, parameters: Floats, gradient: Floats, rates: Floats) -> None:
         """Move `parameters` in place."""
         self.steps += 1
-        corrections = (F(1 / (1 - self.beta1**self.steps)), F(1 / (1 - self.beta2**self.steps)))
+        corrections = (F(1 / (1 - BETA1**self.steps)), F(1 / (1 - BETA2**self.steps)))
         with KERNELS:
             adam_step(
                 parameters, gradient, self.first, self.second, rates, *corrections,
-                F(self.beta1), F(self.beta2), F(self.epsilon),
+                F(BETA1), F(BETA2), F(EPSILON),
             )  # fmt: skip
 
     def select(self, source: npt.NDArray[np.int64], fresh: npt.NDArray[np.bool_]) -> None:

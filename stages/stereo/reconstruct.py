@@ -33,10 +33,6 @@ Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-#: Views that are asked about a depth map: those nearest. All of up to twelve; with more, asking all
-#: would take time that grows with the square of their number.
-MOST_ASKED = 11
-
 #: The completed depth is tried at these shares of the way (in inverse depth) to the far plane.
 _RETREATS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -102,7 +98,7 @@ def complete_depths(
     with kernel_threads(threads):
         grays = [to_gray(image) for image in images]
         others = [
-            nearest_views(index, cameras, camera.unproject(depth)[depth > 0], MOST_ASKED)
+            nearest_views(index, cameras, camera.unproject(depth)[depth > 0])
             for index, (camera, depth) in enumerate(zip(cameras, depths, strict=True))
         ]
         return _finish(depths, confidences, grays, valid, cameras, others, options)
@@ -148,7 +144,7 @@ def _dense_depths(
         depths.append(np.where(keep, depth, 0).astype(np.float32))
         scores.append(ncc)
         progress(index + 1, count)
-    others = [nearest_views(k, cameras, points[k], MOST_ASKED) for k in range(count)]
+    others = [nearest_views(k, cameras, points[k]) for k in range(count)]
     depths, agreeing, angles = _consistent(depths, scores, cameras, others, options)
     confidences = [
         confidence_of(depth, score, number, angle, bright)

@@ -86,7 +86,7 @@ def test_adam_agrees_with_torch() -> None:
     rng = np.random.default_rng(2)
     start = rng.normal(size=(700, 5)).astype(np.float32)
     ours, truth = start.copy(), torch.tensor(start.astype(np.float64), requires_grad=True)
-    adam = Adam(ours.shape, 0.9, 0.999, 1e-15)
+    adam = Adam(ours.shape)
     peer = torch.optim.Adam([truth], lr=1e-2, eps=1e-15)
     for _ in range(5):
         gradient = rng.normal(size=start.shape).astype(np.float32)

@@ -102,7 +102,7 @@ class Warp:
         self.field = SplineField(positions, spacing, levels)
         self.normals: Floats = normals.astype(np.float32)
         self.facing = self.normals
-        self.adam = Adam((len(self.field.coefficients), 1), 0.9, 0.999, 1e-15)
+        self.adam = Adam((len(self.field.coefficients), 1))
         self.views = views
         widths = spacing * 2.0 ** np.arange(levels)
         #: [K] largest coefficients

@@ -118,7 +118,7 @@ class Light(
             [s.light_diffuse, s.light_falloff, s.light_widths[0], s.light_strengths[0],
              s.light_widths[1], s.light_strengths[1]], np.float64,
         )  # fmt: skip
-        self.adam = Adam(self.material.shape, 0.9, 0.999, 1e-15)
+        self.adam = Adam(self.material.shape)
         self.first, self.second = np.zeros(6), np.zeros(6)
         self.radiance: Floats = np.empty((0, 3), np.float32)
         self.by_normal: Floats = np.empty((0, 3), np.float32)
