@@ -77,6 +77,13 @@ def seconds(value: float | None) -> str:
     return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60} s"
 
 
+def as_yaml(values: Any) -> str:
+    """Settings as one writes them."""
+    import yaml
+
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None)
+
+
 def write_page(package: str, template: str, out: Path, **content: Any) -> Path:
     """Fill a template and replace the file in one step.
 

@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.artifacts.metrics import Metrics, Scores
 from pipeline.artifacts.views import read_png
 from pipeline.pages.charts import Bar, Chart, bar_chart, series_chart
-from pipeline.pages.page import REPORT, number, write_page
+from pipeline.pages.page import REPORT, as_yaml, number, write_page
 from pipeline.pages.pictures import Picture, picture, thirds
 from pipeline.pages.tables import Cell, Table, cell
 from pipeline.studies.benchmark.paper import paper_figures
@@ -76,7 +76,7 @@ def benchmark_report(results: Results, out: str | Path) -> Path:
         title=results["title"], note=results["note"], tables=tables, cards=cards,
         problems=list(results.get("problems", [])), notes=notes, rows=rows[:MOST_ROWS],
         more_rows=max(0, len(rows) - MOST_ROWS), failures=failures(results, titles),
-        cells=cells_table(cells, titles), suite=_yaml(results["suite"]),
+        cells=cells_table(cells, titles), suite=as_yaml(results["suite"]),
         machine=results["machine"], versions=sorted(results["versions"].items()),
         date=time.strftime("%Y-%m-%d %H:%M"),
     )  # fmt: skip
@@ -333,9 +333,3 @@ def _psnr(folder: Path, view: str, kind: str) -> float | None:
         scores = metrics.held_out.get(metrics.pictured or "", Scores())
     psnr = scores.views.get(view, {}).get("psnr")
     return float(psnr) if psnr is not None else None
-
-
-def _yaml(values: Any) -> str:
-    import yaml
-
-    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None)

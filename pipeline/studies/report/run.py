@@ -7,15 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
-
-import yaml
+from typing import TypeVar
 
 from pipeline.errors import PipelineError
 from pipeline.installed import library_version
 from pipeline.pages.anonymous import anonymous as without_names
 from pipeline.pages.case import Case, title_of
-from pipeline.pages.page import ANONYMOUS, CHECK, REPORT, seconds, write_page
+from pipeline.pages.page import ANONYMOUS, CHECK, REPORT, as_yaml, seconds, write_page
 from pipeline.pages.parts import Card, Fact, Hero, Link, Part, Section
 from pipeline.pages.pictures import Picture, from_file
 from pipeline.pages.tables import costs
@@ -194,7 +192,7 @@ def settings(case: Case) -> list[tuple[str, str]]:
         if values is not None:
             found.append((record.name, values))
     # Hidden before YAML folds long lines.
-    return [(name, _yaml(case.hide(values))) for name, values in found]
+    return [(name, as_yaml(case.hide(values))) for name, values in found]
 
 
 def versions(case: Case) -> list[tuple[str, str]]:
@@ -222,7 +220,3 @@ def command(case: Case) -> str:
         parts.append(f"--from {request['from']}")
     parts += [f"--set {text}" for text in request.get("overrides", [])]
     return str(case.hide(" ".join(parts)))
-
-
-def _yaml(values: Any) -> str:
-    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None)
