@@ -67,7 +67,7 @@ def read_teeth(count=3, aside=(), numbers=UPPER):
     return Teeth(tuple(dentitions))
 
 
-def found_teeth(yaws=(-40, 0, 40), widths=()):
+def found_teeth(yaws=(-40, 0, 40)):
     poses = [side_pose(yaw) for yaw in yaws]
     maps = [ball_depth(pose) for pose in poses]
     rng = np.random.default_rng(0)

@@ -45,7 +45,7 @@ def shuffled(outlines: list[Outline]) -> list[Outline]:
     return [outlines[k] for k in np.random.default_rng(0).permutation(len(outlines))]
 
 
-def place(dentition: Dentition, point: np.ndarray | None, degrees: float) -> np.ndarray:
+def place(point: np.ndarray | None, degrees: float) -> np.ndarray:
     """A landmark in the frame of the formulas: from the picture's middle, turned back."""
     assert point is not None
     return turned(point[None], -degrees)[0] - MIDDLE
@@ -76,7 +76,7 @@ def test_order_and_landmarks_at_any_roll(degrees: float) -> None:
                 if end.get(name.rpartition("_")[2]):
                     assert getattr(crown, name) is None
                     continue
-                at = place(found, getattr(crown, name), degrees)
+                at = place(getattr(crown, name), degrees)
                 assert np.linalg.norm(at - wanted) < NEAR, (jaw, k, name)
             assert crown.width == pytest.approx(widths[k], abs=NEAR)
             assert crown.height == pytest.approx(HEIGHT, abs=NEAR)
@@ -109,7 +109,7 @@ def test_a_zenith_off_the_middle_is_found() -> None:
     share = 0.4 + ((1 - 0.4) - (1 + 0.4)) * reach / 2
     assert share > 0.15
     for crown, x, width in zip(found.upper, row(UPPER_WIDTHS, "upper"), UPPER_WIDTHS, strict=True):
-        offset = place(found, crown.zenith, 0)[0] - x
+        offset = place(crown.zenith, 0)[0] - x
         assert offset == pytest.approx(share * width / 2, abs=0.5)
 
 
@@ -123,7 +123,7 @@ def test_one_jaw_alone(jaw: Jaw) -> None:
     assert found.jaws_apart == 0
     up = -1 if jaw == "upper" else 1
     for crown in found.crowns(jaw):
-        assert up * (place(found, crown.zenith, 20) - place(found, crown.tip, 20))[1] > 0.9 * HEIGHT
+        assert up * (place(crown.zenith, 20) - place(crown.tip, 20))[1] > 0.9 * HEIGHT
 
 
 def test_across_a_gap_there_is_no_papilla() -> None:
