@@ -198,7 +198,7 @@ def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path
 
 def test_why_photographs_are_set_aside_is_said_where_too_few_are_left(tmp_path, monkeypatch):
     few = ReconstructionError("Two are needed.")
-    with pytest.raises(ReconstructionError, match=r"needed. p0.jpg: it shows.*; p2.*check.html"):
+    with pytest.raises(ReconstructionError, match=r"needed. p0.jpg, p2.jpg: it shows.*check.html"):
         run(tmp_path / "w", monkeypatch, few, read_teeth(aside=(0, 2)))
 
 
