@@ -11,6 +11,9 @@ from typing import Any
 
 from pipeline.untrusted.names import readable
 
+#: Stands before the folder with which a failure's message ends, where the runner kept pictures.
+PICTURES = " Pictures that show it: "
+
 
 class PipelineError(Exception):
     """A failure that is explained to the user in one paragraph, never with a traceback."""

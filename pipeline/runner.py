@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from pipeline import profiling
 from pipeline.config import Config
-from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
+from pipeline.errors import PICTURES, PipelineError, ReconstructionError, RequestError, StageError
 from pipeline.kernels.news import told_to
 from pipeline.kernels.rehearsals import Background
 from pipeline.measure import Measurement
@@ -281,7 +281,7 @@ class Runner:
         if isinstance(failure, ReconstructionError):
             folder = self.store.failures.keep(name, failure.pictures, failure.artifacts)
             if failure.pictures:
-                failure.args = (f"{failure} Pictures that show it: {folder}",)
+                failure.args = (f"{failure}{PICTURES}{folder}",)
         with contextlib.suppress(OSError):
             self.store.failures.record(name, key, str(failure))
         return failure

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, load_config
-from pipeline.errors import PipelineError, ReconstructionError, StageError
+from pipeline.errors import PICTURES, PipelineError, ReconstructionError, StageError
 from pipeline.front.log import Log
 from pipeline.front.pages import DrawnBeside, write_pages
 from pipeline.process.privacy import Share, kept_for, share_for
@@ -109,7 +109,9 @@ def _run(
             if report is not None:
                 reporter.message(f"What came of it so far: {report}")
             if check and isinstance(error, ReconstructionError) and error.artifacts:
-                error.args = (f"{error} To put it right, open {check} in a browser.",)
+                why, shown, pictures = str(error).partition(PICTURES)
+                way = f"To put it right, open {check} in a browser."
+                error.args = (f"{why} {way}{shown}{pictures}",)
             raise
         summary.report, summary.check = write_pages(workspace, config, reporter, drawing)
     return summary

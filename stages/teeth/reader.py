@@ -34,9 +34,9 @@ _LEAST_TOOTH, _LEAST_CROWNS = 0.015, 6
 #: have it. Of 161 photographs of mouths one had .5, all others .67 and more; of eleven of a castle
 #: the windows had up to .5.
 _SURE, _MOST_SURE = 0.8, 0.6
-#: Photographs stand on their heads if they look so much more upright that way. Of 90 photographs of
-#: both rows that are upright none gains, and 86 lose more than this: all 36 of twelve patients' closed
-#: bites (.24 and more) among them. Of 120 generated ones none gains more than .18.
+#: Photographs stand on their heads if they look so much more upright that way. Of 90 photographs
+#: of both rows that are upright none gains, and 86 lose more than this: all 36 of twelve patients'
+#: closed bites (.24 and more) among them. Of 120 generated ones none gains more than .18.
 _MORE_UPRIGHT = 0.2
 #: Of a film, which has one way up, so many frames, evenly chosen, are asked that.
 _FRAMES = 4

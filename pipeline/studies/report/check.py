@@ -20,7 +20,7 @@ from pipeline.artifacts.dental.corrections import (
 )
 from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views, to_uint8
-from pipeline.errors import PipelineError
+from pipeline.errors import PICTURES, PipelineError
 from pipeline.pages.case import Case
 from pipeline.pages.page import CHECK, write_page
 from pipeline.pages.pictures import picture
@@ -63,7 +63,7 @@ def write_check_page(case: Case) -> bool:
         "pipeline.studies.report", TEMPLATE, out, title=case.workspace.resolve().name,
         data=content(teeth, views, corrections)
         | {"command": command(case), "target": "" if own else str(path)},
-        failure=(case.failed.failure or "").partition(" Pictures that show it: ")[0]
+        failure=(case.failed.failure or "").partition(PICTURES)[0]
         if case.failed else "",
         problem=problem, doubtful=round(100 * DOUBTFUL), corrections=CORRECTIONS,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PICTURES, PipelineError
 from pipeline.installed import library_version
 from pipeline.pages.anonymous import anonymous as without_names
 from pipeline.pages.case import Case, title_of
@@ -165,9 +165,7 @@ def failure_pictures(case: Case) -> list[Picture]:
 
 def diagnosis(case: Case) -> str:
     """Why the run failed, without the place of the pictures that the page shows itself."""
-    return (
-        (case.failed.failure or "").partition(" Pictures that show it: ")[0] if case.failed else ""
-    )
+    return (case.failed.failure or "").partition(PICTURES)[0] if case.failed else ""
 
 
 def links(case: Case, parts: Iterable[Part]) -> list[Link]:
