@@ -26,7 +26,6 @@ from pipeline.front.options import (
     Verify,
     Workspace,
     answer,
-    names,
     only_workspace,
     sharing,
 )
@@ -129,7 +128,7 @@ def run_command(
         workspace=workspace,
         preset=config,
         overrides=changes,
-        stages=names(stages),
+        stages=stages,
         from_stage=from_stage,
         force=force,
         dry_run=dry_run,
@@ -163,7 +162,7 @@ def status_command(
         workspace=workspace if workspace or images else only_workspace(),
         preset=config,
         overrides=overrides or [],
-        stages=names(stages),
+        stages=stages,
         verify=verify,
     )
     if as_json:

@@ -121,9 +121,7 @@ def make_request(
     images_named = bool(given)
     taken_over: tuple[str, ...] = ()
     left_out: list[str] = []
-    if isinstance(overrides, Mapping):
-        overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
-    overrides = [anchored(change) for change in overrides]
+    overrides = [anchored(change) for change in each_override(overrides)]
     named_preset = anchored_preset(preset)
     if not given:
         remembered = read_request(folder) if is_workspace(folder) else {}
@@ -140,12 +138,26 @@ def make_request(
         images=tuple(os.path.abspath(p) for p in given),  # noqa: PTH100 - keeps glob characters
         preset=named_preset,
         overrides=tuple(overrides),
-        stages=tuple(stages) if stages else None,
+        stages=each_stage(stages),
         from_stage=from_stage,
         images_named=images_named,
         taken_over=taken_over,
         left_out=tuple(left_out),
     )
+
+
+def each_override(overrides: Iterable[str] | Mapping[str, Any]) -> list[str]:
+    """Settings as ``--set`` has them, each; one alone may be given as it is."""
+    if isinstance(overrides, Mapping):
+        return [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
+    return [overrides] if isinstance(overrides, str) else list(overrides)
+
+
+def each_stage(stages: Sequence[str] | None) -> tuple[str, ...] | None:
+    """Names of stages, each; a string has them as ``--stages``, with commas between them."""
+    if isinstance(stages, str):
+        stages = [name.strip() for name in stages.split(",") if name.strip()]
+    return tuple(stages) if stages else None
 
 
 def anchored_preset(preset: str | Path | None) -> str | None:
@@ -261,6 +273,7 @@ def status(
     Raises:
         RequestError: there is no such workspace, or the request is wrong.
     """
+    stages = each_stage(stages)
     request = make_request(images, workspace, preset, overrides, stages)
     remembered = read_request(request.workspace)
     if not stages:

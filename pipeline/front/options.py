@@ -83,13 +83,6 @@ def answer(
         show()
 
 
-def names(stages: str | None) -> list[str] | None:
-    """Names with commas between them."""
-    if stages is None:
-        return None
-    return [name.strip() for name in stages.split(",") if name.strip()]
-
-
 def sharing(text: str | None) -> Share | None:
     """For whom the results are, as the user says it."""
     return None if text is None else one_of("--share", text, SHARES)

@@ -19,7 +19,6 @@ from pipeline.front.options import (
     Verbose,
     Workspace,
     answer,
-    names,
     one_of,
     only_workspace,
     sharing,
@@ -192,7 +191,7 @@ def batch_command(
 
     results = batch(
         cases, out=out, jobs=jobs, scheduler=scheduler, preset=config, overrides=overrides or [],
-        stages=names(stages), retry=retry or [], keep=one_of("--keep", keep, KEEPS),
+        stages=stages, retry=retry or [], keep=one_of("--keep", keep, KEEPS),
         memory=memory, minutes=minutes, share=sharing(share),
         progress=make_progress(quiet=quiet, verbose=verbose),
     )  # fmt: skip

@@ -22,6 +22,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.errors import RequestError
+
 Share = Literal["nobody", "group"]
 SHARES: tuple[Share, ...] = get_args(Share)
 
@@ -77,8 +79,13 @@ def share_for(folder: Path, asked: Share | None = None) -> Share:
 
     Args:
         asked: what the user says; None: as what is going on around this, else as the folder is.
+
+    Raises:
+        RequestError: it is for nobody that there is.
     """
     if asked is not None:
+        if asked not in SHARES:
+            raise RequestError(f"share is {' or '.join(SHARES)}; this is {asked!r}.")
         return asked
     inherited = _inherited.get()
     if inherited is not None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import load_config, parse_override, presets, result_fields, yaml_value
 from pipeline.errors import RequestError
+from pipeline.process.privacy import share_for
 from pipeline.workspace import make_request
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -161,3 +162,12 @@ def test_paths_of_a_preset_begin_at_its_folder(tmp_path: Path) -> None:
     assert sections["views"].masks == tmp_path / "base" / "m"
     assert sections["init"].pointmap.files == str(tmp_path / "p")
     assert (sections["init"].cameras, sections["fit"].iterations) == ("~/c", 5)
+
+
+def test_one_stage_or_setting_may_be_given_as_it_is(tmp_path: Path) -> None:
+    """Strings are sequences of strings, too: stages='views' was the stages v, i, e, w and s."""
+    request = make_request((), tmp_path, None, "fit.iterations=5", "views, init")
+    assert request.stages == ("views", "init") and request.overrides == ("fit.iterations=5",)
+    assert make_request((), tmp_path, stages="").stages is None
+    with pytest.raises(RequestError, match="share is nobody or group; this is 'all'"):
+        share_for(tmp_path, "all")  # type: ignore[arg-type]

@@ -286,6 +286,8 @@ def test_a_full_disk_ends_the_batch_and_it_goes_on(run: Any, tmp_path: Path) -> 
     listed(tmp_path, a="", b="fit.fail=full")
     with pytest.raises(RequestError, match=r"is full.*run the same command again"):
         run("cases.csv", jobs=1)
+    with pytest.raises(RequestError, match="1 at least; this is 0"):
+        run("cases.csv", jobs=0)
     text = (tmp_path / "cases.csv").read_text().replace("fit.fail=full", "")
     (tmp_path / "cases.csv").write_text(text)
     states = [record["state"] for record in run("cases.csv").values()]

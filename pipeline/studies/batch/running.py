@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pipeline.config import anchored, yaml_value
+from pipeline.config import anchored
 from pipeline.errors import RequestError
 from pipeline.files import write_json
 from pipeline.installed import library_version
@@ -35,7 +35,7 @@ from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import run_case, stop
 from pipeline.studies.jobs import only_one
 from pipeline.untrusted.names import readable
-from pipeline.workspace import anchored_preset
+from pipeline.workspace import anchored_preset, each_override, each_stage
 
 Keep = Literal["workspace", "results"]
 KEEPS: tuple[Keep, ...] = get_args(Keep)
@@ -84,14 +84,15 @@ def batch(
             in it, the disk is full, or the scheduler is gone.
     """
     require_dask()
-    if isinstance(overrides, Mapping):
-        overrides = [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
-    texts = tuple(map(anchored, overrides))
+    if jobs < 1:
+        raise RequestError(f"jobs is how many cases run at a time, 1 at least; this is {jobs}.")
+    texts = tuple(map(anchored, each_override(overrides)))
+    retry = [retry] if isinstance(retry, str) else retry
     place = Path(cases)
     folder = Path(out) if out is not None else Path("runs") / f"batch_{_called(place)}"
     progress = progress or Silent()
     start = time.perf_counter()
-    named = tuple(stages) if stages else None
+    named = each_stage(stages)
     common: dict[str, Any] = {
         "out": str(folder.absolute()), "preset": anchored_preset(preset),
         "overrides": list(texts), "stages": list(named) if named else None, "keep": keep,
