@@ -42,7 +42,8 @@ def run(
             workspace remembers, with the settings of its last run unless a preset is named.
         workspace: where results are kept; default ``./runs/<name of the input>``.
         preset: name or YAML file of a preset.
-        overrides: ``{"sap.quantile": 0.99}``, ``["sap.quantile=0.99"]`` or that alone; see `settings`.
+        overrides: ``{"sap.quantile": 0.99}``, ``["sap.quantile=0.99"]`` or ``"sap.quantile=0.99"``;
+            see `settings`.
         stages: names of the stages to run, in order, or ``"init,sap"``; default all of the preset.
         from_stage: begin here, with what the workspace holds from before.
         force: compute the stages anew although a valid result exists.
