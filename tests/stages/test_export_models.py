@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,19 +24,32 @@ from stages.export.mesh.surface import Mesh, vertex_normals
 from tests.stages.sheet_case import sheet
 
 
-def arch() -> Mesh:
-    """The outside of a small jaw in mm, wavy as teeth are: y up, the front towards z."""
+def jaw(across: int, down: int, section: Callable) -> Mesh:  # type: ignore[type-arg]
+    """The outside of a jaw in mm: y away from the other one, the front towards z.
+
+    Args:
+        across, down: vertices.
+        section: (v in 0..1, angle around y) -> (distance from y, y).
+    """
 
     def shape(u, v):  # type: ignore[no-untyped-def]
-        angle, y = np.pi * (0.15 + 0.7 * u), 7 * v
-        radius = 9 + 0.5 * np.cos(14 * angle) * (1 - v) + 0.6 * v
+        angle = np.pi * (0.15 + 0.7 * u)
+        radius, y = section(v, angle)
         return radius * np.cos(angle), y, radius * np.sin(angle)
 
-    mesh = sheet(90, 30, shape, lambda u, v: (u, v, v))
-    middle = mesh.faces[len(mesh.faces) // 2]
-    a, b, c = mesh.vertices[middle]
-    outward = np.cross(b - a, c - a) @ (a * [1, 0, 1])
-    return mesh if outward > 0 else replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy())
+    mesh = sheet(across, down, shape, lambda u, v: (u, v, v))
+    outward = (vertex_normals(mesh) * mesh.vertices * [1, 0, 1]).sum() > 0
+    return mesh if outward else replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy())
+
+
+def through(places: list[float], radii: list[float], heights: list[float]) -> Callable:  # type: ignore[type-arg]
+    """A section with corners at some v."""
+    return lambda v, angle: (np.interp(v, places, radii), np.interp(v, places, heights))
+
+
+def arch() -> Mesh:
+    """Wavy as teeth are."""
+    return jaw(90, 30, lambda v, a: (9 + 0.5 * np.cos(14 * a) * (1 - v) + 0.6 * v, 7 * v))
 
 
 def test_a_closed_model_is_watertight_and_keeps_what_was_seen() -> None:
@@ -66,19 +80,8 @@ def test_a_closed_model_is_watertight_and_keeps_what_was_seen() -> None:
 def test_nothing_made_up_hides_what_was_seen_of_a_jaw() -> None:
     """Below the other jaw's teeth a mesh goes on forward in a ledge, which looks down."""
 
-    def shape(u, v):  # type: ignore[no-untyped-def]
-        angle = np.pi * (0.15 + 0.7 * u)
-        radius = np.interp(v, [0, 0.5, 1], [14, 9, 9.6])
-        return (
-            radius * np.cos(angle),
-            np.interp(v, [0, 0.5, 1], [-0.5, 0, 7]),
-            radius * np.sin(angle),
-        )
-
-    mesh = sheet(90, 40, shape, lambda u, v: (u, v, v))
+    mesh = jaw(90, 40, through([0, 0.5, 1], [14, 9, 9.6], [-0.5, 0, 7]))
     normals = vertex_normals(mesh)
-    if normals[1000] @ (mesh.vertices[1000] * [1, 0, 1]) < 0:
-        mesh, normals = replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy()), -normals
     model = closed(mesh, height=3.0, depth=4.0, voxel=0.3)
     assert model is not None and is_closed(model)
     solid = trimesh.Trimesh(model.vertices, model.faces, process=False)
@@ -116,13 +119,6 @@ def test_whatever_is_solid_gets_a_surface_without_loose_ends() -> None:
         assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
 
 
-def facing_out(mesh: Mesh) -> Mesh:
-    """With normals away from the axis of an arch."""
-    normals = vertex_normals(mesh)
-    outward = (normals * mesh.vertices * [1, 0, 1]).sum() > 0
-    return mesh if outward else replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy())
-
-
 def inside(model: Mesh, points: np.ndarray) -> np.ndarray:
     """[N] whether points [N, 3] are in a closed mesh."""
     seen = _Seen(model)
@@ -137,11 +133,7 @@ def around(radius: float, angles: np.ndarray, y: float) -> np.ndarray:
 def test_crowns_that_lean_outwards_are_solid_up_to_their_edge() -> None:
     """By 3 mm, as upper front teeth do: what is behind the edge is in front of the gum."""
 
-    def shape(u, v):  # type: ignore[no-untyped-def]
-        angle, radius = np.pi * (0.15 + 0.7 * u), np.interp(v, [0, 0.6, 1], [15, 12, 12])
-        return radius * np.cos(angle), 8 * v, radius * np.sin(angle)
-
-    mesh = facing_out(sheet(120, 40, shape, lambda u, v: (u, v, v)))
+    mesh = jaw(120, 40, through([0, 0.6, 1], [15, 12, 12], [0, 4.8, 8]))
     model = closed(mesh, height=3.0, depth=5.0, voxel=0.3)
     assert model is not None and is_closed(model)
     angles = np.linspace(0.25 * np.pi, 0.75 * np.pi, 30)
@@ -152,13 +144,11 @@ def test_crowns_that_lean_outwards_are_solid_up_to_their_edge() -> None:
 
 
 def test_below_a_ragged_border_the_model_goes_on_evenly() -> None:
-    def shape(u, v):  # type: ignore[no-untyped-def]
-        angle = np.pi * (0.15 + 0.7 * u)
+    def section(v, angle):  # type: ignore[no-untyped-def]
         y = v * (7 + 1.5 * np.sign(np.sin(40 * angle)))  # the gum is seen down to 5.5 or 8.5
-        radius = 12 + 0.15 * y
-        return radius * np.cos(angle), y, radius * np.sin(angle)
+        return 12 + 0.15 * y, y
 
-    mesh = facing_out(sheet(160, 40, shape, lambda u, v: (u, v, v)))
+    mesh = jaw(160, 40, section)
     model = closed(mesh, height=6.0, depth=4.0, voxel=0.3)
     assert model is not None and is_closed(model)
     wall = model.vertices[np.abs(model.vertices[:, 1] - 12.5) < 0.2]
@@ -172,16 +162,7 @@ def test_below_a_ragged_border_the_model_goes_on_evenly() -> None:
 def test_a_jaw_that_was_seen_from_behind_as_well_stays_as_it_is() -> None:
     """A film shows the chewing surface and the inside, too."""
 
-    def shape(u, v):  # type: ignore[no-untyped-def]
-        angle = np.pi * (0.15 + 0.7 * u)
-        radius = np.interp(v, [0, 0.4, 0.6, 1], [15.5, 15, 11, 10.5])
-        y = np.interp(v, [0, 0.4, 0.6, 1], [8, 0, 0, 8])
-        return radius * np.cos(angle), y, radius * np.sin(angle)
-
-    mesh = sheet(120, 80, shape, lambda u, v: (u, v, v))
-    top = np.argmin(np.abs(mesh.vertices[:, 1]))
-    if vertex_normals(mesh)[top, 1] > 0:
-        mesh = replace(mesh, faces=mesh.faces[:, [0, 2, 1]].copy())
+    mesh = jaw(120, 80, through([0, 0.4, 0.6, 1], [15.5, 15, 11, 10.5], [8, 0, 0, 8]))
     model = closed(mesh, height=3.0, depth=4.0, voxel=0.3)
     assert model is not None and is_closed(model)
     angles = np.linspace(0.25 * np.pi, 0.75 * np.pi, 30)
@@ -193,16 +174,7 @@ def test_a_jaw_that_was_seen_from_behind_as_well_stays_as_it_is() -> None:
 
 
 def test_gum_that_curls_in_at_its_border_does_not_cut_the_base() -> None:
-    def shape(u, v):  # type: ignore[no-untyped-def]
-        angle = np.pi * (0.15 + 0.7 * u)
-        radius = np.interp(v, [0, 0.8, 1], [12, 12, 10.5])
-        return (
-            radius * np.cos(angle),
-            np.interp(v, [0, 0.8, 1], [0, 7, 7.3]),
-            radius * np.sin(angle),
-        )
-
-    mesh = facing_out(sheet(120, 50, shape, lambda u, v: (u, v, v)))
+    mesh = jaw(120, 50, through([0, 0.8, 1], [12, 12, 10.5], [0, 7, 7.3]))
     model = closed(mesh, height=4.0, depth=4.0, voxel=0.3)
     assert model is not None and is_closed(model)
     angles = np.linspace(0.25 * np.pi, 0.75 * np.pi, 30)
