@@ -141,7 +141,8 @@ def write_visit(workspace: Path, visit: Visit) -> Path:
     views, dentitions, means, colors = [], [], [], []
     for look in visit.looks:
         name = look.camera.name
-        views.append(View(name, np.repeat(look.image[..., None], 3, 2).clip(0, 1)))
+        image = np.repeat(look.image[..., None], 3, 2).clip(0, 1)
+        views.append(View(name, image, source_name=f"right {name}.jpg"))
         rows: dict[str, list[Crown]] = {"upper": [], "lower": []}
         for number in (int(n) for n in np.unique(look.labels) if n):
             contours, _ = cv2.findContours(

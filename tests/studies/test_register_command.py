@@ -87,6 +87,8 @@ def test_the_command_writes_table_page_and_mesh(written: tuple[Path, Result]) ->
     page = (out / "register.html").read_text()
     assert "how far these may be off is not known" in page and ">unknown<" in page
     assert page.count("data:image/jpeg") == 9
+    for text in ("photograph 000 · right 000.jpg; arrows", "from the same place (000 · right 0"):
+        assert text in page, text
     assert "http" not in page.replace("http-equiv", "")
     assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
 

@@ -91,6 +91,7 @@ class Visit:
         frame: [4, 4] similarity from that world to this frame.
         covered: FDI number -> [3] middle of a crown with the hardware on it; none without braces.
         files: hash -> name of each file that its photographs were read from.
+        labels: how pages call its photographs, by their names.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Visit:
     frame: Array = field(default_factory=lambda: np.eye(4))
     covered: Mapping[int, Array] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def scale_doubt(self) -> float:
@@ -189,7 +191,10 @@ def read_visit(workspace: Path) -> Visit:
         percent, source = 100 * TEXTBOOK_DEVIATION, SOURCES["textbook_teeth"]
     read_from = case.by_name["views"].manifest["key_material"]["sources"]
     files = {hashed: name for name, hashed in read_from if not name.startswith(MASK_PREFIX)}
-    made = Visit(workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians, files=files)
+    made = Visit(
+        workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians, files=files,
+        labels=case.labels,
+    )  # fmt: skip
     made = made.in_frame(frame)
     made = without_braces(made, pictures)
     return replace(made, scale_percent=percent, scale_source=source)

@@ -69,10 +69,12 @@ def _measure(value: float, half: float, digits: int, sign: str, best: bool) -> C
 
 
 def shown_cameras(visit: Visit) -> list[tuple[str, Camera]]:
-    """A few of a visit's cameras: the first, the middle and the last from right to left."""
+    """A few of a visit's cameras, each after what its photograph is called: the first, the middle
+    and the last from right to left."""
     order = sorted((look for look in visit.looks), key=lambda look: float(look.camera.centre[0]))
     picks = sorted({0, len(order) // 2, len(order) - 1})
-    return [(order[k].camera.name, order[k].camera) for k in picks]
+    cameras = [order[k].camera for k in picks]
+    return [(visit.labels.get(camera.name, camera.name), camera) for camera in cameras]
 
 
 def scenes(found: Comparison) -> list[tuple[Picture, Picture]]:
@@ -105,7 +107,7 @@ def tinted(found: Comparison) -> list[Picture]:
     by_name = {look.camera.name: look for look in found.first.looks}
     result = []
     for name, camera in shown_cameras(found.first):
-        look = by_name[name]
+        look = by_name[camera.name]
         image = np.repeat(look.image[..., None], 3, 2).astype(np.float64)
         for tooth in found.teeth:
             inside = look.labels == tooth.tooth
