@@ -105,6 +105,19 @@ def test_pictures_that_do_not_fit_widen_the_interval(
         assert tooth.deviation == pytest.approx(wider * before), number
 
 
+def test_what_certainly_moved_is_no_reference(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where pictures say little, what noise may do is far enough to take a moved tooth in."""
+    taken_in = tuple(replace(way, still=(12, *way.still)) for way in ways)
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: taken_in)
+    plain = {t.tooth: t for t in found.teeth}
+    again = compare_visits(found.first, found.second)
+    assert again.still == found.still
+    for tooth in again.teeth:
+        assert tooth.parts == pytest.approx(plain[tooth.tooth].parts, abs=1e-6), tooth.tooth
+
+
 def test_what_one_way_lost_the_other_finds(
     found: comparing.Comparison, begun: list[Started], motions: dict
 ) -> None:

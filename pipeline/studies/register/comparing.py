@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +52,7 @@ class Moved:
             the interval.
         certain: it moved: at least one part lies beyond its interval, with room for there being
             six of them.
-        still: it belongs to the teeth that everything is measured against.
+        still: it belongs to the teeth that everything is measured against; `certain` ones don't.
         at: [3] the point whose shift is given: the middle of what is seen of the crown at the first
             visit, in its frame, mm.
         motion: [4, 4] of the tooth in that frame.
@@ -141,14 +140,20 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
             "at check.html of both workspaces: a wrong tooth number is the usual cause."
         )
     factor = "many" if min(len(first.looks), len(second.looks)) >= MANY else "few"
-    backwards = _mirrored(back, there, BY_PHOTOGRAPH[factor])
-    teeth = tuple(_teeth(first, there, backwards, back.fits, factor))
+    teeth = _teeth(first, there, back, factor)
+    # What went no farther than most do by noise alone may still be sure to have moved.
+    while moved := {t.tooth for t in teeth if t.certain} & {*there.still, *back.still}:
+        there, back = (
+            replace(way, still=tuple(n for n in way.still if n not in moved))
+            for way in (there, back)
+        )
+        teeth = _teeth(first, there, back, factor)
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
     joint = refined_frame(first, second, frame, there.still)
     return Comparison(
-        first, second, joint, teeth, tuple(sorted(missing)), likeness, share,
+        first, second, joint, tuple(teeth), tuple(sorted(missing)), likeness, share,
         max(there.residual, back.residual), surer.scale_percent, surer.scale_source,
         scale_of(joint) / scaled_by, scaled_by,
     )  # fmt: skip
@@ -204,21 +209,19 @@ def _mirrored(
     return found
 
 
-def _teeth(
-    first: Visit, there: Estimate, back: Mapping[int, tuple[Array, Array]],
-    back_fits: Mapping[int, float], factor: str,
-) -> list[Moved]:  # fmt: skip
+def _teeth(first: Visit, there: Estimate, back: Estimate, factor: str) -> list[Moved]:
     """Both ways together: their mean; what they differ by adds to the doubt.
 
     So do pictures that do not fit, where photographs are few.
     """
     axes = tooth_axes(first.centres)
     result = []
-    ways = measured(there, BY_PHOTOGRAPH[factor])
-    for number, (forward, covariance) in sorted(ways.items()):
+    forwards = measured(there, BY_PHOTOGRAPH[factor])
+    backwards = _mirrored(back, there, BY_PHOTOGRAPH[factor])
+    for number, (forward, covariance) in sorted(forwards.items()):
         displacement = forward
-        if number in back:
-            other, its = back[number]
+        if number in backwards:
+            other, its = backwards[number]
             displacement = (forward + other) / 2
             half = (forward - other) / 2
             covariance = (covariance + its) / 2 + np.outer(half, half)
@@ -226,7 +229,7 @@ def _teeth(
         parts = leads @ displacement
         deviation = np.sqrt(np.maximum(np.diag(leads @ covariance @ leads.T), 0))
         if factor == "few":
-            fits = [way[number] for way in (there.fits, back_fits) if number in way]
+            fits = [way.fits[number] for way in (there, back) if number in way.fits]
             deviation *= misfit(min(fits, default=RANGE[0]))
         interval = halves(deviation, FACTORS[factor], FLOORS[factor])
         mine = [s for s in there.spots if s.tooth == number and len(s.points)]

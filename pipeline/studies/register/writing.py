@@ -104,8 +104,8 @@ def table(found: Comparison) -> str:
 
 
 def color_of(tooth: Moved) -> Array:
-    """[3] sRGB 0..1: grey for what stood still, pale yellow to dark red by distance."""
-    if tooth.still or not tooth.certain:
+    """[3] sRGB 0..1: grey for what did not certainly move, else yellow to dark red by distance."""
+    if not tooth.certain:
         return np.array([0.72, 0.74, 0.76])
     share = min(tooth.distance[0] / FARTHEST, 1.0)
     stops = np.array([[1.0, 0.9, 0.45], [0.96, 0.5, 0.15], [0.7, 0.05, 0.1]])
