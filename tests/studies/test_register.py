@@ -247,6 +247,13 @@ def test_two_patients_are_refused() -> None:
         compare_visits(anna, berta)
 
 
+def test_teeth_of_one_side_are_refused_in_words() -> None:
+    visit = toy_visit("anna")
+    right = {n: points for n, points in visit.teeth.items() if n // 10 in (1, 4)}
+    with pytest.raises(ReconstructionError, match=r"'anna' .*: teeth of both sides are needed"):
+        compare_visits(visit, replace(visit, teeth=right, name="anna"))
+
+
 def test_teeth_that_no_frame_brings_together_are_refused() -> None:
     visit = toy_visit("anna")
     few = {n: points for n, points in visit.teeth.items() if n in (11, 12, 13)}

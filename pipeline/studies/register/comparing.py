@@ -121,6 +121,13 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
         ReconstructionError: they are of two patients, or share too few teeth.
     """
     frame, agreeing = _frame(first, second)
+    for visit in (first, second):
+        try:
+            tooth_axes(visit.centres)
+        except ValueError as error:
+            raise ReconstructionError(
+                f"Of '{visit.name}' it can't be told what is mesial and what is buccal: {error}."
+            ) from error
     surer, scaled_by = first, 1.0
     if second.scale_doubt < first.scale_doubt:  # the surer millimetre counts for both
         surer, scaled_by = second, 1 / scale_of(frame)
