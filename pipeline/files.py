@@ -83,6 +83,18 @@ def _is_running(process: int) -> bool:
     return True
 
 
+def make_writable(folder: Path) -> None:
+    """Make a folder if it isn't there, and try that files can be written into it.
+
+    Raises:
+        OSError: they can't.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    probe = temporary_beside(folder / "write-test")
+    probe.write_text("")
+    probe.unlink()
+
+
 def write_atomic(path: Path, text: str) -> None:
     """Replace a small text file in one step: a reader sees the old content or the new.
 

@@ -32,8 +32,8 @@ from pipeline.files import (
     folder_listing,
     fsync_folder,
     fsync_tree,
+    make_writable,
     remove_leftovers,
-    temporary_beside,
 )
 from pipeline.process.privacy import share_for
 from pipeline.store import checks
@@ -98,10 +98,7 @@ class Store:
             RequestError: it can't be made or written to.
         """
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            probe = temporary_beside(self.root / "write-test")
-            probe.write_text("")
-            probe.unlink()
+            make_writable(self.root)
             remove_leftovers(self.root)
             tell(tighten_workspace(self.root, share_for(self.root), set(more)))
         except OSError as error:

@@ -1,4 +1,4 @@
-"""What batches and benchmarks do alike: a folder for one alone, jobs in processes, faults told."""
+"""What studies do alike: a folder of their own, jobs in processes, faults told."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from typing import Any
 from filelock import Timeout
 
 from pipeline.errors import RequestError
+from pipeline.files import make_writable
 from pipeline.store import Store
+from pipeline.store.faults import reason_of
 from pipeline.store.locks import lock_of
 from pipeline.untrusted.names import readable
 
@@ -42,6 +44,28 @@ def only_one(folder: Path, study: str, within: Iterable[str], wait: str) -> Iter
         yield folder
     finally:
         lock.release()
+
+
+@contextlib.contextmanager
+def results_in(folder: Path) -> Iterator[None]:
+    """Make the folder that results are to be written into; without any in the end it goes again.
+
+    Raises:
+        RequestError: it can't be written to, as is to be known before the work.
+    """
+    new = not folder.exists()
+    try:
+        make_writable(folder)
+    except OSError as error:
+        raise RequestError(
+            f"{folder} can't be written to ({reason_of(error)}). Name another folder with -o."
+        ) from error
+    try:
+        yield
+    finally:
+        if new:
+            with contextlib.suppress(OSError):  # it holds some
+                folder.rmdir()
 
 
 def given_job() -> dict[str, Any]:

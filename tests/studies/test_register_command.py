@@ -14,7 +14,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.errors import RequestError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.studies.register import comparing, run_register, solving
 from pipeline.studies.register.visit import Visit
 from tests.browser import needs_chromium, run_in
@@ -131,6 +131,21 @@ def test_photographs_that_both_visits_hold_are_named(
         assert f"of {named}, byte for byte" in page.read_text()
         warning = json.loads((tmp_path / "out" / "register.json").read_text())["warning"]
         assert warning == said.splitlines()[0]
+
+
+def test_a_folder_that_cannot_be_written_is_said_before_the_work(
+    workspaces: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(first: Visit, second: Visit) -> comparing.Comparison:
+        raise ReconstructionError("not one patient")
+
+    monkeypatch.setattr(comparing, "compare_visits", refused)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RequestError, match="can't be written to"):
+        run_register(*workspaces, tmp_path / "file" / "out")
+    with pytest.raises(ReconstructionError):
+        run_register(*workspaces, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:

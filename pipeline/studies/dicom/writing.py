@@ -26,6 +26,7 @@ from pipeline.studies.dicom.exports import exports_of
 from pipeline.studies.dicom.identity import checked, uid, valid_uid
 from pipeline.studies.dicom.objects import Picture, Solid, data_sets
 from pipeline.studies.dicom.written import Written
+from pipeline.studies.jobs import results_in
 from pipeline.studies.report.reading import read_case
 from pipeline.workspace import is_workspace
 
@@ -68,25 +69,25 @@ def write_all(
         )
     scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
     solids, left_out = _solids(results, scale, scene.get("frame", {}), unscaled)
-    pictures = [*_preview(results), *_views(case, views)]
-    if not pictures and not solids:
-        raise RequestError(
-            f"{results} holds nothing that becomes a DICOM file: no preview and no mesh with a "
-            "scale. With --unscaled a mesh without one is written as well."
-        )
-    made = data_sets(pictures, solids, said)
-    problems: list[str] = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        before = clear(folder, made)
-        for name, dataset in made.items():
-            _write(folder / name, dataset)
-            problems += [f"{name}: {text}" for text in read_back(folder / name, dataset)]
-    except OSError as error:
-        raise RequestError(
-            f"The DICOM files can't be written to {folder} ({error.strerror or error}). Name "
-            "another folder with -o."
-        ) from error
+    with results_in(folder):
+        pictures = [*_preview(results), *_views(case, views)]
+        if not pictures and not solids:
+            raise RequestError(
+                f"{results} holds nothing that becomes a DICOM file: no preview and no mesh with a "
+                "scale. With --unscaled a mesh without one is written as well."
+            )
+        made = data_sets(pictures, solids, said)
+        problems: list[str] = []
+        try:
+            before = clear(folder, made)
+            for name, dataset in made.items():
+                _write(folder / name, dataset)
+                problems += [f"{name}: {text}" for text in read_back(folder / name, dataset)]
+        except OSError as error:
+            raise RequestError(
+                f"The DICOM files can't be written to {folder} ({error.strerror or error}). Name "
+                "another folder with -o."
+            ) from error
     titles = {picture.name: picture.title for picture in pictures}
     titles |= {solid.name: solid.title for solid in solids}
     removed = tuple(name for name in before if name not in made)

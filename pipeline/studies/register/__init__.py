@@ -70,23 +70,26 @@ def _registered(
     """Compare, and write what came of it."""
     from pipeline.errors import RequestError
     from pipeline.process.privacy import kept_for, share_for
+    from pipeline.studies.jobs import results_in
     from pipeline.studies.register.comparing import compare_visits
     from pipeline.studies.register.page.writing import write_register_page
     from pipeline.studies.register.visit import read_visit
     from pipeline.studies.register.writing import write_files
+    from pipeline.workspace import read_request
 
+    for workspace in workspaces:
+        read_request(workspace)  # no folder is made in what is none
     steps = len(workspaces) + 2
-    visits = []
-    for number, workspace in enumerate(workspaces):
-        hears.progress(NAME, f"read {workspace}", number, steps)
-        visits.append(read_visit(workspace))
-    hears.progress(NAME, "compare the teeth", len(visits), steps)
-    found = compare_visits(visits[0], visits[1])
-    hears.progress(NAME, "write", len(visits) + 1, steps)
     folder = Path(out) if out is not None else workspaces[1] / "register"
-    with kept_for(share_for(workspaces[1])):
+    with kept_for(share_for(workspaces[1])), results_in(folder):
+        visits = []
+        for number, workspace in enumerate(workspaces):
+            hears.progress(NAME, f"read {workspace}", number, steps)
+            visits.append(read_visit(workspace))
+        hears.progress(NAME, "compare the teeth", len(visits), steps)
+        found = compare_visits(visits[0], visits[1])
+        hears.progress(NAME, "write", len(visits) + 1, steps)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             write_files(found, folder)
         except OSError as error:
             raise RequestError(f"{folder} can't be written to ({error.strerror}).") from error
