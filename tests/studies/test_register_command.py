@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.studies.register import comparing, run_register, solving
-from pipeline.studies.register.visit import Visit
+from pipeline.studies.register.visit import Visit, names_of
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
 
@@ -146,6 +146,13 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
     with pytest.raises(ReconstructionError):
         run_register(*workspaces, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_visits_whose_folders_are_called_alike_are_told_apart(tmp_path: Path) -> None:
+    may, june = (tmp_path / month / "anna" for month in ("may", "june"))
+    assert names_of([may, june]) == ["may/anna", "june/anna"]
+    assert names_of([may, june.parent]) == ["anna", "june"]
+    assert names_of([may, may]) == ["anna", "anna"]
 
 
 def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:

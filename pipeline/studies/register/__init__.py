@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,7 @@ def _registered(
     from pipeline.studies.jobs import results_in
     from pipeline.studies.register.comparing import compare_visits
     from pipeline.studies.register.page.writing import write_register_page
-    from pipeline.studies.register.visit import read_visit
+    from pipeline.studies.register.visit import names_of, read_visit
     from pipeline.studies.register.writing import write_files
     from pipeline.workspace import read_request
 
@@ -83,9 +84,11 @@ def _registered(
     folder = Path(out) if out is not None else workspaces[1] / "register"
     with kept_for(share_for(workspaces[1])), results_in(folder):
         visits = []
-        for number, workspace in enumerate(workspaces):
+        for number, (workspace, name) in enumerate(
+            zip(workspaces, names_of(workspaces), strict=True)
+        ):
             hears.progress(NAME, f"read {workspace}", number, steps)
-            visits.append(read_visit(workspace))
+            visits.append(replace(read_visit(workspace), name=name))
         hears.progress(NAME, "compare the teeth", len(visits), steps)
         found = compare_visits(visits[0], visits[1])
         hears.progress(NAME, "write", len(visits) + 1, steps)

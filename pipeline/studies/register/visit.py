@@ -200,6 +200,16 @@ def read_visit(workspace: Path) -> Visit:
     return replace(made, scale_percent=percent, scale_source=source)
 
 
+def names_of(workspaces: Sequence[Path]) -> list[str]:
+    """What visits are called: their folders, with those above where these are called alike."""
+    ways = [workspace.resolve().parts for workspace in workspaces]
+    for depth in range(1, max(map(len, ways)) + 1):
+        names = ["/".join(way[-depth:]) for way in ways]
+        if len({*names}) == len({*ways}):
+            break
+    return names
+
+
 def said_of_shared(first: Visit, second: Visit) -> str:
     """What has to be known where both visits hold a file; empty: they don't.
 
