@@ -158,6 +158,13 @@ def test_a_mesh_without_scale_is_not_written_unless_asked(tmp_path: Path) -> Non
     ("patient", "said"),
     [
         ({"PatientBirthDate": "4.7.2019"}, "--birth-date '4.7.2019' is not what DICOM allows"),
+        ({"PatientBirthDate": "20230231"}, "--birth-date '20230231'"),
+        ({"PatientBirthDate": "20200101-20210101"}, "a day that has been"),
+        ({"PatientBirthDate": "29991231"}, "a day that has been"),
+        ({"PatientName": "^"}, "--patient-name '^'"),
+        ({"PatientName": "A^B^C^D^E^F"}, "a name as Family^Given"),
+        ({"PatientID": " "}, "--patient-id ' '"),
+        ({"StudyInstanceUID": "1"}, "--study-uid '1'"),
         ({"PatientSex": "female"}, "M, F or O"),
         ({"PatientID": "a\\b"}, "no backslash"),
         ({"PatientID": ""}, "--patient-id"),

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from datetime import date, datetime
 from typing import Any
 
 from pydicom.dataset import Dataset
@@ -49,11 +50,9 @@ def checked(patient: Mapping[str, str]) -> dict[str, str]:
         kind = _KINDS[keyword]
         try:
             validate_value(kind, value, 2)
-            ok = bool(value) and "\\" not in value and value.isprintable()
+            ok = _MEANT[kind](value) and "\\" not in value and value.isprintable()
         except ValueError:
             ok = False
-        if keyword == "PatientSex":
-            ok = value in ("M", "F", "O")
         if not ok:
             raise RequestError(
                 f"{GIVEN[keyword]} {value!r} is not what DICOM allows there: {_ALLOWED[kind]}."
@@ -62,11 +61,33 @@ def checked(patient: Mapping[str, str]) -> dict[str, str]:
     return found
 
 
+def _says_something(value: str) -> bool:
+    return any(character.isalnum() for character in value)
+
+
+def _is_name(value: str) -> bool:
+    return _says_something(value) and all(group.count("^") < 5 for group in value.split("="))
+
+
+def _is_past_day(value: str) -> bool:
+    return len(value) == 8 and datetime.strptime(value, "%Y%m%d").date() <= date.today()
+
+
+def valid_uid(text: str) -> bool:
+    """Is it a UID?"""
+    return len(text) <= 64 and bool(re.fullmatch(r"(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*))+", text))
+
+
+#: Kind of value -> is it one? pydicom allows blanks alone, days that no month has, ranges of days.
+_MEANT: dict[str, Callable[[str], bool]] = {
+    "LO": _says_something, "SH": _says_something, "PN": _is_name, "DA": _is_past_day,
+    "CS": ("M", "F", "O").__contains__, "UI": valid_uid,
+}  # fmt: skip
 _ALLOWED = {
-    "LO": "at most 64 letters, no backslash",
-    "SH": "at most 16 letters, no backslash",
+    "LO": "letters or digits, at most 64, no backslash",
+    "SH": "letters or digits, at most 16, no backslash",
     "PN": "a name as Family^Given, at most 64 letters",
-    "DA": "a day as YYYYMMDD",
+    "DA": "a day that has been, as YYYYMMDD",
     "CS": "M, F or O",
     "UI": "numbers with points between them, at most 64 letters",
 }
@@ -99,8 +120,3 @@ def describe_patient(dataset: Dataset, patient: Mapping[str, str], study: str) -
     dataset.AccessionNumber = patient.get("AccessionNumber", "")
     if any(not value.isascii() for value in patient.values()):
         dataset.SpecificCharacterSet = "ISO_IR 192"
-
-
-def valid_uid(text: str) -> bool:
-    """Is it a UID?"""
-    return len(text) <= 64 and bool(re.fullmatch(r"(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*))+", text))
