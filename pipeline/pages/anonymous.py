@@ -59,7 +59,7 @@ class Secrets:
         Pictures and drawings are left as they are.
         """
         if isinstance(value, str):
-            return value if value.startswith(("data:", "<")) else self._hide(value)
+            return value if value.startswith(("data:image/", "<svg ")) else self._hide(value)
         if is_dataclass(value) and not isinstance(value, type):
             own = [entry.name for entry in fields(value) if entry.init]
             return replace(value, **{name: self.hide(getattr(value, name)) for name in own})

@@ -118,6 +118,7 @@ def test_a_report_without_names(sample_run: RunSummary) -> None:
     ("said", "shown"),
     [
         ("The photograph Prognath_Anna_left.jpg is blurred.", "The photograph 002 is blurred."),
+        ("<Prognath> is the same picture as 001.", "<[name]> is the same picture as 001."),
         ("Pictures: /srv/patients/Anna/w/init/failure.", "Pictures: [path]"),
         ("on the right and 3/4 of it, see a/b", "on the right and 3/4 of it, see a/b"),
         ({"given": ["C:\\cases\\Prognath\\x.json", 3]}, {"given": ["[path]", 3]}),
