@@ -259,6 +259,8 @@ def test_distances_between_clouds():
     figures = clouds.against_cloud(grid[:500] + np.array([0, 0, 0.25]), IDENTITY, grid, 10.0)
     assert figures["to_other_percent"]["median"] == pytest.approx(2.5)
     assert figures["from_other_percent"]["mean"] > 10
+    point = grid[:1]  # a model of one point has no extent; JSON has no infinite figures
+    assert clouds.against_cloud(grid, IDENTITY, point, clouds.robust_extent(point)) == {}
 
 
 def test_numbered_photographs_are_not_taken_for_numbered_views(tmp_path, monkeypatch):

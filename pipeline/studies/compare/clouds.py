@@ -148,9 +148,9 @@ def against_cloud(points: Array, motion: Motion, other: Array, extent: float) ->
         points: [N, 3].
         motion: similarity to the frame of `other`.
         other: [M, 3].
-        extent: length in that frame.
+        extent: length in that frame; 0: `other` has none, and nothing is measured by it.
     """
-    if not len(points) or not len(other):
+    if not len(points) or not extent:
         return {}
     moved = moved_by(drawn(points), motion)
     towards = cKDTree(other).query(moved)[0]
