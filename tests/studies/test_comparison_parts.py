@@ -22,6 +22,7 @@ from pipeline.studies.compare.colmap_run import (
     thresholds,
 )
 from pipeline.studies.compare.models import read_largest
+from pipeline.studies.compare.tables import tables_of
 from stages.views.orientation import make_upright, upright_from_stored
 from tests.studies.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 
@@ -261,6 +262,14 @@ def test_distances_between_clouds():
     assert figures["from_other_percent"]["mean"] > 10
     point = grid[:1]  # a model of one point has no extent; JSON has no infinite figures
     assert clouds.against_cloud(grid, IDENTITY, point, clouds.robust_extent(point)) == {}
+
+
+def test_points_without_anything_to_measure_them_by_are_counted():
+    row = {"name": "sap (ours)", "points": 4711}
+    figures = {"reference": "ground truth", "units": "mm", "cameras": [], "points": [row]}
+    (table,) = tables_of(figures)
+    assert table.rows == [["sap (ours)", "4,711"]]
+    assert "nearest" not in table.explanation
 
 
 def test_numbered_photographs_are_not_taken_for_numbered_views(tmp_path, monkeypatch):

@@ -108,6 +108,12 @@ def _points(figures: Mapping[str, Any]) -> Table:
             "Aligned by the cameras, then by ICP with scale."
         )
         return Table("Points", text, head, cells, notes)
+    if not any("cloud" in row for row in rows):
+        text = (
+            "How many there are: without a true surface (--mesh) or a model of COLMAP's, no more."
+        )
+        counts = [[row["name"], f"{row['points']:,}"] for row in rows]
+        return Table("Points", text, ["points", "count"], counts, notes)
     head = ["points", "count", "to COLMAP's, %", "from COLMAP's, %"]
     cells = [
         [
