@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.studies.benchmark.paper import ABLATIONS, PHOTOS, VIEWS, paper_figures
 from pipeline.studies.benchmark.statistics import compare, figure_of, summarise
-from pipeline.studies.benchmark.suite import Suite
+from pipeline.studies.benchmark.suite import Method, Suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
 from pipeline.studies.benchmark.writing import csv_text, grid_markdown, markdown
 
@@ -196,6 +196,8 @@ def test_the_papers_figures() -> None:
     assert paper_figures("ablations", None, 6) == "absent"
     assert "195 clinical videos" in paper_note(suite())
     assert "The data differ" in paper_note(suite())
+    own = suite().model_copy(update={"methods": (Method(name="mine"),)})
+    assert paper_note(own) == "Measured on a, b.", "none of the paper's stand beside them"
 
 
 def test_markdown_and_csv() -> None:

@@ -79,6 +79,7 @@ def benchmark_report(results: Results, out: str | Path) -> Path:
         cells=cells_table(cells, titles), suite=as_yaml(results["suite"]),
         machine=results["machine"], versions=sorted(results["versions"].items()),
         date=time.strftime("%Y-%m-%d %H:%M"),
+        quoted=any(method.get("paper") for method in results["suite"]["methods"]),
     )  # fmt: skip
 
 

@@ -55,8 +55,10 @@ class Rows:
 
 
 def paper_note(suite: Suite) -> str:
-    """The plain sentence about the data."""
+    """The plain sentence about the data; of figures of the paper where a method has some."""
     scenes = ", ".join(scene.name for scene in suite.scenes)
+    if not any(method.paper for method in suite.methods):
+        return f"Measured on {scenes}."
     sources = dict.fromkeys(DATA[table.form] for table in suite.tables)
     return (
         f"Ours are measured on {scenes}; the paper's figures beside them come from "
