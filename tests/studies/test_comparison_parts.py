@@ -12,7 +12,7 @@ import pytest
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.geometry.models.model_points import as_points, read_model_points
-from pipeline.studies.compare import clouds, evidence, poses
+from pipeline.studies.compare import clouds, colmap_run, evidence, poses
 from pipeline.studies.compare.colmap_run import (
     SETTINGS,
     Job,
@@ -178,6 +178,21 @@ def test_a_crash_of_colmap_is_told(tmp_path):
     assert done["models"] == 0 and "ended with status" in done["failure"]
 
 
+def test_what_ended_early_is_run_again(tmp_path, monkeypatch):
+    failures = iter(["COLMAP ended with status -9", None])
+
+    def fake(folder, job):
+        (folder / "sparse").mkdir()
+        return {"models": 0, "seconds": 1.0, "failure": next(failures)}
+
+    monkeypatch.setattr(colmap_run, "run_job", fake)
+    for failure in ("COLMAP ended with status -9", None, None):
+        done = run_on_views(
+            tmp_path / "colmap", views_of(["a.png"]), {}, seed=0, threads=1, message=print
+        )
+        assert done["failure"] == failure
+
+
 def test_known_focal_lengths_and_masks_reach_colmap(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "masks").mkdir()
@@ -274,8 +289,6 @@ def test_points_without_anything_to_measure_them_by_are_counted():
 
 def test_numbered_photographs_are_not_taken_for_numbered_views(tmp_path, monkeypatch):
     """Views 000, 001, 002 of photographs 001, 002, 000: only the right cameras may match."""
-    from pipeline.studies.compare import colmap_run
-
     cameras = true_cameras()
     names = ["001.png", "002.png", "000.png"]
 

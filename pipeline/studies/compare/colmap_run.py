@@ -78,7 +78,7 @@ def run_on_views(
     folder: Path, views: Sequence[View], options: Options, *, seed: int, threads: int,
     message: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Run COLMAP on prepared views, or take what an earlier call with the same input left.
+    """Run COLMAP on prepared views, or take what an earlier call with the same input came to.
 
     The images are written as their files are stored (before EXIF orientation), at working size, so
     that the model is one of the photographs at another size; masks and EXIF's focal lengths are
@@ -99,7 +99,9 @@ def run_on_views(
     _write_images(fresh, views)
     key = _key(fresh, job, photo_names(views))
     done = read_own(folder / "run.json")
-    if done is not None and done["key"] == key and done["made"] == _made(folder):
+    # What a signal ended, or a lack of memory, may come to its end this time.
+    asked = {"key": key, "failure": None}
+    if done is not None and done | asked == done and done["made"] == _made(folder):
         remove(fresh)
         return done
     message(f"COLMAP ({folder.name.removeprefix('colmap_')}) on {len(views)} views")
