@@ -215,6 +215,13 @@ def test_the_surer_scale_counts_and_how_far_the_first_run_was_scaled_is_said(
         assert centre == pytest.approx(again.first_scaled_by * first.centres[number])
 
 
+def test_words_say_what_is_certain(found: comparing.Comparison) -> None:
+    """One of six parts may lie beyond its interval by chance: that is no movement."""
+    beyond = replace(found, teeth=tuple(replace(t, half=t.half / 1e6) for t in found.teeth))
+    for tooth in described(beyond)["teeth"]:
+        assert tooth["words"].startswith("no movement") != tooth["moved"], tooth["fdi"]
+
+
 def test_teeth_that_stood_still_lie_on_each_other_in_one_frame(
     found: comparing.Comparison,
 ) -> None:

@@ -79,7 +79,7 @@ def _tooth(tooth: Moved) -> dict[str, Any]:
         "motion": np.round(tooth.motion, 6).tolist(),
         "photographs": tooth.photographs,
         "spots": tooth.spots,
-        "words": words(tooth.parts, tooth.half),
+        "words": words(tooth.parts, tooth.half if tooth.certain else np.full(6, np.inf)),
     }
 
 
