@@ -95,6 +95,10 @@ def test_overrides_come_in_order(folder: Path) -> None:
         ({"tables": [{"name": "t", "form": "table"}]}, "'views', 'photos' or 'ablations'"),
         ({"tables": [{"name": "t", "form": "photos", "views": [3]}]}, "Leave `views` out"),
         (
+            {"tables": [{"name": "t", "form": "photos", "protocol": "test_every"}]},
+            "has no numbers of views",
+        ),
+        (
             {
                 "scenes": [{"name": "mouth", "images": "frames"}],
                 "tables": [{"name": "t", "form": "views", "known_cameras": True}],

@@ -221,6 +221,11 @@ def _check_names(path: Path, suite: Suite) -> None:
                 f"{where} takes all photographs as input (protocol: all), so that it can't have "
                 "numbers of views too. Leave `views` out, or choose the protocol test_every."
             )
+        if not table.view_counts:
+            raise RequestError(
+                f"{where} has no numbers of views, so that it measures nothing. Say them, as in "
+                "views: [3]."
+            )
         if table.known_cameras:
             blind = [n for n in table.scenes or scenes if suite.scene(n).ground_truth is None]
             if blind:
