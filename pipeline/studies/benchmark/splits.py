@@ -47,6 +47,8 @@ def pictures_of(images: Sequence[Path]) -> list[Path]:
     for place in images:
         if place.is_dir():
             found += [path for path in place.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+        elif place.is_file():
+            found.append(place)
         else:
             found += [Path(name) for name in glob.glob(str(place))]  # noqa: PTH207 - absolute
     where = ", ".join(map(str, images))
