@@ -30,6 +30,8 @@ WORDS = frozenset({
     "scans", "share", "shared", "side", "srv", "teeth", "tmp", "tooth", "ubuntu", "upper", "user",
     "users", "usr", "var", "video", "view", "volume", "volumes", "work", "workspace",
 })  # fmt: skip
+#: So many digits are no number that photographs are counted by.
+LONG = 6
 #: Where a path begins: at a root (with a drive's letter), or at a home.
 _ROOT = r"(?:[A-Za-z]:|~\w*)?[/\\]"
 #: A path from there up to what ends it in a sentence or, where it stands in quotes, to their end.
@@ -106,8 +108,10 @@ def secrets_of(case: Case) -> Secrets:
 
 
 def _tells(text: str, known: frozenset[str]) -> bool:
-    """Could it be somebody's name? A letter alone and numbers could not."""
-    return len(text) > 1 and text.lower() not in known and bool(re.search(r"[^\W\d_]", text))
+    """Could it tell who somebody is? A letter alone and short numbers could not; a date, the number
+    of a patient and the UID of a picture could."""
+    letters, digits = re.search(r"[^\W\d_]", text), len(re.findall(r"\d", text))
+    return len(text) > 1 and text.lower() not in known and (bool(letters) or digits >= LONG)
 
 
 def _paths(case: Case) -> Iterator[str]:

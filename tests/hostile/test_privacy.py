@@ -170,6 +170,19 @@ def test_photographs_that_no_stage_could_use_are_not_named(tmp_path: Path) -> No
         assert hide("Anna_left.jpg is too small. -c paper") == "[name] is too small. -c paper"
 
 
+def test_dates_and_uids_that_photographs_are_called_by_are_not_told(tmp_path: Path) -> None:
+    from pipeline.pages.anonymous import secrets_of
+    from pipeline.pages.case import Case
+
+    uid, date, place = "1.2.840.113619.2.5", "20240512_101533", "0003"
+    for name in (uid, f"{date}.jpg", f"{place}.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    request = {"images": [str(tmp_path)], "preset": None, "overrides": []}
+    hide = secrets_of(Case(tmp_path / "w", request, ())).hide
+    assert hide(f"{uid} is the same picture.") == "[name] is the same picture."
+    assert hide(f"no mask {date}.png, of 0003 points") == "no mask [name].png, of 0003 points"
+
+
 def test_settings_of_a_report_without_names(tmp_path: Path) -> None:
     """Also where the page folds a long path into two lines."""
     workspace = report_case.write_case(tmp_path / "Otto Meier", ("views", "init", "fit"))
