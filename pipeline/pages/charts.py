@@ -193,20 +193,24 @@ def camera_plot(
     Args:
         series: (name of the stage, its cameras, what brings them into the last one's world); the
             last is drawn boldest, with names.
-        points: [N, 3] in the last one's world.
+        points: [N, 3] in the last one's world; none: cameras alone are drawn.
         colors: [N, 3] in 0..1.
         axis: ``"top"`` or ``"front"``.
     """
     cameras = series[-1][1]
     frame = scene_frame(cameras)
-    centre = np.median(points, axis=0) if len(points) else np.zeros(3)
+    places = np.array([camera.centre for camera in cameras]).reshape(-1, 3)
+    around = points if len(points) else places
+    centre = np.median(around, axis=0) if len(around) else np.zeros(3)
     rows = frame[[0, 2]] if axis == "top" else frame[[0, 1]]
 
     def flat(world: npt.NDArray[np.floating]) -> Array:
         return np.asarray((np.asarray(world, np.float64) - centre) @ rows.T)
 
-    distances = [np.linalg.norm(camera.centre - centre) for camera in cameras]
-    depth = 0.12 * float(np.median(distances)) if len(distances) else 1.0
+    distances = np.linalg.norm(places - centre, axis=1)
+    # Of cameras alone the farthest from their middle is about as far as a scene would be.
+    far = float(np.median(distances) if len(points) else distances.max(initial=0.0))
+    depth = 0.12 * far or 1.0
     behind = scene_frame(cameras)[1 if axis == "top" else 2]
     near_last = np.argsort(-((np.asarray(points, np.float64) - centre) @ behind), kind="stable")
 

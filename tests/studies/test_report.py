@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.artifacts.cameras import Cameras
+from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.metrics import Scores
 from pipeline.artifacts.pictures import Pictures
 from pipeline.artifacts.teeth import Dentition, Teeth
@@ -235,6 +235,20 @@ def test_the_nearest_point_is_on_top() -> None:
     assert (image[30, 30] == (255, 0, 0)).all()
     image = points_image(np.vstack([near, far]), colors, np.diag([1.0, 1, -1]), (60, 60))
     assert (image[30, 30] == (0, 0, 255)).all()
+
+
+def test_cameras_far_from_the_origin_of_their_world_are_drawn_as_large() -> None:
+    nothing = np.zeros((0, 3), np.float32)
+
+    def drawn(away: float) -> str:
+        cameras = []
+        for k in range(4):
+            pose = np.eye(4)
+            pose[:3, 3] = k + away, 0, 0
+            cameras.append(Camera(f"{k:03d}", 64, 48, 60.0, 60.0, 32.0, 24.0, pose))
+        return camera_plot([("truth", cameras, None)], nothing, nothing, "top").svg
+
+    assert drawn(4096.0) == drawn(0.0)
 
 
 def test_pictures_are_scaled_down_and_described() -> None:
