@@ -31,6 +31,22 @@ QUICK = {
     "coarse_fraction": 0.0, "detail": False, "extension": 0.0, "lambda_flow": 0.0, "densify": False,
     "opacity_reset_interval": 0, "sh_degree_interval": 0,
 }  # fmt: skip
+#: Gaussians of a trial: how the light moves shows long before any detail
+TRIAL_POINTS = 8000
+#: dB by which a light has to be better on the photographs that a trial leaves out
+MARGIN = 0.3
+#: On a held surface there is a light if its shading lowers the error of predicting the photographs
+#: from one another to this share, and leaves no more than this (mean, 0..1). A light that is there
+#: leaves .024 to .067 (samples, scan video, generated mouths).
+EVIDENCE, UNEXPLAINED = 0.7, 0.07
+#: From this error up a trial has the last word: photographs of which each had a flash, an exposure
+#: and a white balance of its own may look lit (.061 to .073 with the share of the three nearest of
+#: fourteen real sets), and are 5 to 13 dB worse with one light for all.
+CERTAIN = 0.045
+#: Steps of that trial, and how much more error (RMS, 0..1) a light may leave than none. It leaves
+#: .0014 more at most where there is one (seventeen triples of the samples and the scan video,
+#: neighbours 9 to 48 degrees apart), and .0042 to .035 more on thirteen sets of real photographs.
+CHECK_ITERATIONS, CHECK_MARGIN = 80, 0.0025
 #: how much a matte surface counts against one camera, for harmonics of each degree
 MATTE = (1e-3, 0.03, 0.1, 0.3)
 
@@ -48,7 +64,7 @@ def choose_light(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, fl
     if not settings.hold_surface:
         return _by_prediction(scene, settings)
     light, figures = _by_shading(scene, settings)
-    if light == "none" or figures["light_error_camera"] <= settings.light_certain:
+    if light == "none" or figures["light_error_camera"] <= CERTAIN:
         return light, figures
     light, tried = _by_training(scene, settings)
     return light, figures | tried
@@ -65,7 +81,7 @@ def _by_shading(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, flo
     if errors is None:
         return "none", {}
     without, lit = errors
-    better = lit <= min(settings.light_evidence * without, settings.light_unexplained)
+    better = lit <= min(EVIDENCE * without, UNEXPLAINED)
     figures = {"light_error_none": round(without, 4), "light_error_camera": round(lit, 4)}
     return ("camera" if better else "none"), figures
 
@@ -77,13 +93,13 @@ def _by_training(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, fl
     shading of what they share. A light that is the same for all can't come near them, while
     harmonics with exposures do; where there is one light for all, shading comes as near.
     """
-    quick = settings.but(iterations=settings.light_check_iterations, **QUICK)
+    quick = settings.but(iterations=CHECK_ITERATIONS, **QUICK)
     few, scores, errors = scene.reduced(settings.light_trial_factor), {}, {}
     for name, lit in LIGHTS:
         trainer = _tried(few, quick, lit)
         every = trainer.training_scores()[0] if trainer else np.zeros(1)
         scores[name], errors[name] = float(every.mean()), float((10 ** (-every / 20)).mean())
-    better = errors["camera"] <= errors["none"] + settings.light_check_margin
+    better = errors["camera"] <= errors["none"] + CHECK_MARGIN
     return ("camera" if better else "none"), _tried_figures(scores)
 
 
@@ -91,8 +107,8 @@ def _by_prediction(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, 
     """Fit most photographs, with and without a light, and see which predicts the others.
 
     Those left out have a neighbour on either side: the model is to fill gaps, not to extrapolate.
-    Small images and few Gaussians: how the light moves shows long before any detail. But not few
-    steps: a light takes longer to find than harmonics, and would lose to them at first.
+    Small images and few Gaussians, but not few steps: a light takes longer to find than harmonics,
+    and would lose to them at first.
     The figures are the mean PSNR of either on the photographs that were left out.
     """
     held, factor = between_others(scene.cameras), settings.light_trial_factor
@@ -112,13 +128,13 @@ def _by_prediction(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, 
             image = trainer.composited(None, trainer.look(viewpoint))
             every.append(target.colour(np.clip(image, 0, 1), settings.lambda_dssim).psnr)
         scores[name] = float(np.mean(every))
-    better = scores["camera"] >= scores["none"] + settings.light_margin
+    better = scores["camera"] >= scores["none"] + MARGIN
     return ("camera" if better else "none"), _tried_figures(scores)
 
 
 def _tried(scene: Scene, settings: FitSettings, lit: bool) -> Trainer | None:
     """A quick fit of few Gaussians; None if it diverged (if the real one does as well, it says)."""
-    trainer = scene.trainer(settings.but(initial_points=settings.light_trial_points), lit)
+    trainer = scene.trainer(settings.but(initial_points=TRIAL_POINTS), lit)
     try:
         trainer.run(None, lambda *_: None)
     except ReconstructionError:

@@ -69,9 +69,7 @@ class FitStage(Stage):
                 "loosen what the earlier stages prune (sap, align)."
             )
         placed_cameras = [by_name[view.name] for view in placed]
-        held = worth_holding(
-            placed_cameras, points.positions.astype(float), context.config.hold_min_angle
-        )
+        held = worth_holding(placed_cameras, points.positions.astype(float))
         pixels = max(view.image.shape[0] * view.image.shape[1] for view in placed)
         settings = resolve(context.config, len(placed), context.seed, held, pixels)
 

@@ -18,7 +18,6 @@ from stages.fit.settings import (
     Count,
     Pair,
     PartSettings,
-    Share,
     Weight,
     automatic,
 )
@@ -80,28 +79,8 @@ class Light(
         """what the light's, albedos' and normals' rates have fallen to at the end"""
         light_trial_iterations: Count = 300
         """steps of each trial of light: auto"""
-        light_trial_points: Annotated[int, Field(ge=100)] = 8000
-        """Gaussians of each trial of light: auto"""
         light_trial_factor: Annotated[int, Field(ge=1, le=16)] = 4
         """by which factor its images are reduced"""
-        light_margin: Weight = 0.3
-        """dB by which the trial with a light has to be better on the held-out photographs"""
-        light_evidence: Share = 0.7
-        """on a held surface there is a light if its shading lowers the error of predicting the
-        photographs from one another to this share"""
-        light_unexplained: Share = 0.07
-        """and if it leaves no more error than this (mean, 0..1). A light that is there leaves .024
-        to .067 (samples, scan video, generated mouths)"""
-        light_certain: Share = 0.045
-        """from this error up a trial has the last word: photographs of which each had a flash, an
-        exposure and a white balance of its own may look lit (.061 to .073 with the share of the
-        three nearest of fourteen real sets), and are 5 to 13 dB worse with one light for all"""
-        light_check_iterations: Count = 80
-        """steps of that trial, with a light and without"""
-        light_check_margin: Weight = 0.0025
-        """how much more error (RMS, 0..1) a light may leave there than none. It leaves .0014 more
-        at most where there is one (seventeen triples of the samples and the scan video, neighbours
-        9 to 48 degrees apart), and .0042 to .035 more on thirteen sets of real photographs"""
 
     def __init__(self, fit: Trainer) -> None:
         from stages.splatting.adam import Adam
