@@ -30,7 +30,8 @@ class FusionOptions:
         fill_stride: every so many pixels in x and y, one fill pixel is considered.
         relative_depth: relative difference of depth within which two views see the same surface.
         front: a depth this share in front of what another view sees there is refuted.
-        min_agreeing: other views that must agree; 0: nothing but not being refuted.
+        min_agreeing: other views that must agree, all where there are fewer; 0: nothing but not
+            being refuted.
         merge: drop a pixel that a more confident view explains (else every view's pixel stays).
     """
 
@@ -213,7 +214,7 @@ def fuse(
             each(
                 _fuse_row, shape[0], v, others, depth_stack, confidence_stack, image_stack, table,
                 np.float32(options.fill_confidence), float(options.relative_depth),
-                float(options.front), int(options.min_agreeing), bool(options.merge),
+                float(options.front), min(options.min_agreeing, len(others)), bool(options.merge),
                 keep, depth, color, residual,
             )  # fmt: skip
             thinned = np.zeros(shape, bool)

@@ -115,7 +115,10 @@ class AlignConfig(StageConfig):
         description="A depth this share in front of what other views see there is refuted.",
     )  # fmt: skip
     min_agreeing: int = Field(
-        0, ge=0, le=100, description="Other views that must agree with a point."
+        0,
+        ge=0,
+        le=100,
+        description="Other views that must agree with a point (all, where there are fewer).",
     )
     merge: bool = Field(
         True,
@@ -127,7 +130,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 7
+    version = 8
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")

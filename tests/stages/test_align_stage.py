@@ -225,6 +225,16 @@ def test_floaters_are_refuted_and_fill_yields_to_measurements(world):
     assert alone.fill == len(range(61, 70, 3)) * len(range(40, 60, 3))
 
 
+def test_of_few_views_no_more_are_asked_to_agree_than_there_are(world):
+    cameras, images, depths = (part[:3] for part in world)
+    trust = [np.full(z.shape, 5.0, np.float32) for z in depths]
+    every, more = (
+        fuse(depths, trust, images, cameras, FusionOptions(min_agreeing=number), 1)
+        for number in (2, 100)
+    )
+    assert len(every) == len(more) > 0
+
+
 def test_a_view_that_sees_through_counts_as_much_as_one_that_agrees(world):
     cameras, images, depths = (part[:3] for part in world)
     trust = [np.full(z.shape, 5.0, np.float32) for z in depths]
