@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,13 +18,14 @@ from stages.fit.inputs.initial import (
     smooth_normals,
     thin,
 )
-from stages.fit.inputs.scene import out_of_place, trusted_points
+from stages.fit.inputs.scene import out_of_place, prepare, trusted_points
 from stages.fit.inputs.targets import Target, make_target
 from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
 from stages.fit.parts.camera import Background, Focal, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
 from stages.splatting.harmonics import harmonics
 from stages.splatting.rasterizer import Viewpoint, rasterize
+from tests.stages.fit_case import case
 
 
 def packed_scene(count: int, seed: int = 0) -> np.ndarray:
@@ -176,6 +178,16 @@ def test_thinning_keeps_confidence_a_confidence() -> None:
     thinned = thin(cloud, 300)
     assert 200 < len(thinned) < 400
     assert thinned.weight.min() >= 1 and thinned.weight.max() <= 7
+
+
+def test_what_was_measured_keeps_its_share_of_the_gaussians() -> None:
+    views, cameras, points = case()
+    across = points.positions[:, 0]
+    aside = across > np.quantile(across, 0.75)
+    points = replace(points, confidence=np.where(aside, 1.2, 5).astype(np.float32))
+    settings = resolve(FitConfig(fill_share=1.0, initial_points=400, light="none"), 3, 0)
+    start = prepare(views.views, cameras.cameras, points, None, settings).start(settings)
+    assert 0.7 < (start.weight > 2).mean() < 0.9
 
 
 def test_filled_points_that_a_view_contradicts_are_left_out() -> None:

@@ -82,8 +82,9 @@ class Scene:
         """The points that become Gaussians: measured ones first, a limited share filled in."""
         trusted, fill = self.cloud.select(self.trusted), self.cloud.select(~self.trusted)
         count = settings.initial_points
-        room = int(count * settings.fill_share)
-        fill = thin(fill, room) if room and len(fill) else fill.select(np.zeros(len(fill), bool))
+        # however large a share is allowed, what was measured keeps its own
+        room = int(count * min(settings.fill_share, len(fill) / max(len(self.cloud), 1)))
+        fill = thin(fill, room) if room else fill.select(np.zeros(len(fill), bool))
         measured = thin(trusted, count - len(fill))
         measured = smooth_normals(measured, settings.normal_neighbours)
         return Cloud(
