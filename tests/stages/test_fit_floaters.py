@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.errors import ReconstructionError
 from stages.fit.parts.density import before_lens, contribution
 from stages.fit.stage import FitStage
 from stages.splatting.rasterizer import Viewpoint, pack, rasterize
@@ -61,6 +62,11 @@ def with_a_dark_side(confidence: float):
         shown.append(replace(view, image=image))
     sure = np.where(points.positions[:, 0] < 5, np.float32(5), np.float32(confidence))
     return replace(views, views=tuple(shown)), cameras, replace(points, confidence=sure), dark
+
+
+def test_a_fit_that_is_pruned_away_names_the_setting_that_may_have_done_it(tmp_path) -> None:
+    with pytest.raises(ReconstructionError, match=r"fit\.final_prune_contribution or another"):
+        FitStage().run(context(tmp_path, *case(), light="none", final_prune_contribution=1e6))
 
 
 @pytest.mark.parametrize(

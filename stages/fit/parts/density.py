@@ -202,9 +202,9 @@ class Floaters(
         keep = worth_keeping(fit, self.positions)
         if not keep.any():
             raise ReconstructionError(
-                "Nothing is left of the fit: no Gaussian colours any photograph. The points and "
-                "the cameras that it started from don't agree; look at what align and sap made of "
-                "them."
+                "Nothing is left of the fit: all Gaussians were pruned at its end. Unless that is "
+                "by fit.final_prune_contribution or another setting of yours, the points and the "
+                "cameras that it started from don't agree; look at what align and sap made of them."
             )
         self.removed = int((~keep).sum())
         rows = np.flatnonzero(keep)
