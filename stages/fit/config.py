@@ -90,7 +90,7 @@ class Basics(PartSettings):
     """learning rate of log scales (3DGS: 0.005)"""
     rotation_lr: AutoFloat = automatic({3: 2e-3, 6: 6e-3}, held=4e-3)
     """learning rate of rotations (3DGS: 0.001)"""
-    near: Positive = 0.05
+    near: Annotated[float, Field(gt=0, lt=1)] = 0.05
     """near plane, as a share of the scene's median depth"""
     divergence_factor: Annotated[float, Field(gt=1)] = 5.0
     """stop where the loss (running mean) exceeds its best by this factor"""

@@ -30,13 +30,11 @@ if TYPE_CHECKING:  # code meets settings whose "auto" has become a value
     AutoBool = bool
     AutoInt = int
     AutoFloat = float
-    AutoPair = Pair
     AutoColour = Colour
 else:
     AutoBool = Literal["auto"] | bool
     AutoInt = Literal["auto"] | int
     AutoFloat = Literal["auto"] | float
-    AutoPair = Literal["auto"] | Pair
     AutoColour = Literal["auto"] | Colour
 
 

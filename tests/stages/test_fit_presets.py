@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from pipeline.config import Config, load_config, result_fields
 from stages.fit.config import PARTS, FitConfig, FitSettings, PartName, resolve
+from stages.fit.parts.light import HIGHEST, LOWEST
 from stages.fit.stage import FitStage
 from tests.stages.fit_case import case, context
 
@@ -100,6 +101,16 @@ def test_an_extension_for_good_fits_alone_is_refused() -> None:
     for pair in ((60, 10), (20, 20)):
         with pytest.raises(ValidationError, match="must be higher than the first"):
             FitConfig(extension_psnr=pair)
+
+
+def test_what_no_fit_can_begin_with_is_refused() -> None:
+    for setting in (
+        {"near": 1.0}, {"light_widths": (200, 0)}, {"light_widths": (-5, 25)},
+        {"light_strengths": (0, 0.04)}, {"light_strengths": (0.5, 2)},
+    ):  # fmt: skip
+        with pytest.raises(ValidationError, match="Input should be"):
+            FitConfig(**setting)
+    assert FitConfig(light_widths=LOWEST[[2, 4]].tolist(), light_strengths=HIGHEST[[3, 5]].tolist())
 
 
 def test_isotropic_is_refused_with_what_makes_gaussians_flat_or_long() -> None:

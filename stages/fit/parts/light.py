@@ -14,9 +14,7 @@ from stages.fit.parts.base import Part, Step
 from stages.fit.parts.objectives import Variation
 from stages.fit.settings import (
     AutoFloat,
-    AutoPair,
     Count,
-    Pair,
     PartSettings,
     Weight,
     automatic,
@@ -31,6 +29,13 @@ if TYPE_CHECKING:
 #: exceeds. They keep a wrong start from running away.
 LOWEST = np.array([0.0, 0.0, 20.0, 1e-3, 2.0, 1e-4])
 HIGHEST = np.array([0.98, 4.0, 2000.0, 5.0, 40.0, 1.0])
+#: the same of what a user says of the narrow lobe and of the broad one
+Widths = tuple[Annotated[float, Field(ge=20, le=2000)], Annotated[float, Field(ge=2, le=40)]]
+Strengths = tuple[Annotated[float, Field(ge=1e-3, le=5)], Annotated[float, Field(ge=1e-4, le=1)]]
+if TYPE_CHECKING:
+    AutoStrengths = Strengths
+else:
+    AutoStrengths = Literal["auto"] | Strengths
 #: steps after which normals are made unit again: only their direction means something, but their
 #: length is what Adam's step is relative to
 RENORMALISE = 10
@@ -56,9 +61,9 @@ class Light(
         """share k of light that comes from the lens: 1 - k + k n.v, to start with"""
         light_falloff: Annotated[float, Field(ge=0, le=4)] = 2.0
         """exponent of the light's falloff, to start with"""
-        light_widths: Pair = (200.0, 25.0)
+        light_widths: Widths = (200.0, 25.0)
         """exponents m of the narrow and broad highlight lobe, to start with"""
-        light_strengths: AutoPair = automatic({3: (0.5, 0.04)}, held=(0.3, 0.04), ge=None)
+        light_strengths: AutoStrengths = automatic({3: (0.5, 0.04)}, held=(0.3, 0.04), ge=None)
         """strengths of the two lobes in linear light, to start with"""
         light_gamma: Annotated[float, Field(ge=1, le=4)] = 2.2
         """exponent of the photographs' encoding"""
