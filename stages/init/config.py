@@ -104,6 +104,13 @@ class DenseConfig(StageConfig):
         DENSE.fill_reach_px, gt=0, le=4096, description="reach of known depth into holes"
     )
 
+    @field_validator("window", "polish_window")
+    @classmethod
+    def _odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise PydanticCustomError("odd", "a window with a pixel in its middle is odd")
+        return value
+
 
 class RefinementConfig(StageConfig):
     """The last adjustment of cameras from features, and what is tried where it fails."""
@@ -319,7 +326,7 @@ class InitConfig(StageConfig):
     min_views_fraction: float = Field(
         0.5, ge=0, le=1, description="share of the views that must be placed (of 3: all)"
     )
-    squeezes: tuple[float, ...] = Field(
+    squeezes: tuple[Annotated[float, Field(ge=0.1, le=1)], ...] = Field(
         (1.0, 0.71, 0.5), min_length=1, max_length=8,
         description="horizontally squeezed copies of the image that features are taken from; but "
         "1 only where a view is linked to less than two others without them",

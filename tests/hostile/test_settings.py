@@ -151,6 +151,10 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
         ("seed=true", "seed=true is not allowed: it is a number"),
         ("fit.iterations=true", "fit.iterations=true is not allowed: it is a number"),
         ("init.length.start=[true, 2]", "init.length.start=true is not allowed: it is a number"),
+        ("init.squeezes=[1, 0]", "init.squeezes.1=0 is not allowed"),
+        ("init.squeezes=[-1]", "init.squeezes.0=-1 is not allowed"),
+        ("init.dense.window=4", "is not allowed: a window with a pixel in its middle is odd"),
+        ("init.dense.polish_window=30", "is not allowed: a window with a pixel in its middle"),
     ],
 )
 def test_a_setting_that_is_not_understood_is_refused(text: str, words: str) -> None:
