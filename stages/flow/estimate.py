@@ -126,7 +126,7 @@ def _residual(
     empty = np.zeros((*images[0].shape, 2), np.float32)
     if method == "dis":
         dis = cv2.DISOpticalFlow.create(_DIS_PRESETS[preset])
-        dis.setFinestScale(finest_scale)
+        dis.setFinestScale(min(finest_scale, _levels(images[0].shape, dis.getPatchSize())))
         dis.setVariationalRefinementAlpha(smoothness)
         flow = dis.calc(images[0], images[1], empty)
     else:
@@ -135,6 +135,12 @@ def _residual(
             pyr_scale=0.5, levels=5, winsize=15, iterations=5, poly_n=7, poly_sigma=1.5, flags=0,
         )  # fmt: skip
     return np.ascontiguousarray(flow[:height, :width], np.float32)
+
+
+def _levels(shape: tuple[int, ...], patch: int) -> int:
+    """The coarsest level of DIS; asked to stop at a coarser one, it would choose a finer itself."""
+    by_motion = np.log(max(shape) / (4 * patch)) / np.log(2) + 0.5
+    return max(0, int(min(by_motion, np.log(min(shape) // patch) / np.log(2))))
 
 
 def consistency_mask(

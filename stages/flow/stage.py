@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.flow import Flow, FlowPair
@@ -20,6 +21,8 @@ _POOR_SHARE = 0.1
 #: where the views are this near to each other (degrees) or nobody knows how near: of wider ones
 #: nothing better is expected. It is what a user is asked to photograph at.
 _NEAR = 20.0
+#: A narrower window (sigma, pixels) holds hardly more than the pixel whose mean is taken out.
+LEAST_WINDOW = 0.5
 
 
 class FlowConfig(StageConfig):
@@ -30,7 +33,11 @@ class FlowConfig(StageConfig):
         "medium", description="Effort of DIS: medium is the most accurate."
     )
     dis_finest_scale: int = Field(
-        0, ge=0, le=5, description="Pyramid level at which DIS stops; 0 is full resolution."
+        0,
+        ge=0,
+        le=5,
+        description="Pyramid level at which DIS stops; 0 is full resolution. Small photographs "
+        "have fewer levels: it stops at the last one.",
     )
     dis_smoothness: float = Field(
         40.0, ge=0, le=1000,
@@ -88,12 +95,20 @@ class FlowConfig(StageConfig):
         "of the flash move with the camera); 1 switches the test off.",
     )  # fmt: skip
 
+    @field_validator("contrast_window")
+    @classmethod
+    def _more_than_a_pixel(cls, value: float) -> float:
+        if 0 < value < LEAST_WINDOW:
+            why = f"in a window of less than {LEAST_WINDOW} nothing is left of a photograph"
+            raise PydanticCustomError("window", "{why}", {"why": why})
+        return value
+
 
 class FlowStage(Stage):
     """Views (and cameras and points, where there are any) -> flow of neighbouring views."""
 
     name = "flow"
-    version = 2
+    version = 3
     summary = "optical flow between neighbouring views, both ways, with consistency masks"
     Config = FlowConfig
     requires = ("views",)

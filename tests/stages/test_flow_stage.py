@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.flow import Flow, FlowPair
@@ -16,7 +17,7 @@ from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from stages.flow.geometry import occluded, predicted_flow
-from stages.flow.stage import FlowConfig, FlowStage
+from stages.flow.stage import LEAST_WINDOW, FlowConfig, FlowStage
 from tests.stages import flow_scene as scene
 
 Shot = tuple[Camera, View, np.ndarray]
@@ -210,3 +211,10 @@ def test_bytes_do_not_depend_on_threads(tmp_path: Path, method: str) -> None:
         cv2.setNumThreads(before)
     assert len(written[0]) == 4
     assert written[0] == written[1] == written[2]
+
+
+def test_a_window_that_leaves_nothing_of_a_photograph_is_refused():
+    with pytest.raises(ValidationError, match="nothing is left of a photograph"):
+        FlowConfig(contrast_window=LEAST_WINDOW / 2)
+    for window in (0, LEAST_WINDOW):
+        assert FlowConfig(contrast_window=window).contrast_window == window
