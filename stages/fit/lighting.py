@@ -111,8 +111,9 @@ def _by_prediction(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, 
     and would lose to them at first.
     The figures are the mean PSNR of either on the photographs that were left out.
     """
-    held, factor = between_others(scene.cameras), settings.light_trial_factor
-    rest, scores = scene.reduced(factor).without(held), {}
+    left_out, factor = between_others(scene.cameras), settings.light_trial_factor
+    rest, scores = scene.reduced(factor).without(left_out), {}
+    held = [view for view in left_out if scene.targets[view][factor].colour.mask.any()]
     quick = settings.but(
         iterations=settings.light_trial_iterations, **QUICK,
         optimize_poses=False, exposure=False, warp_levels=0,
@@ -127,7 +128,7 @@ def _by_prediction(scene: Scene, settings: FitSettings) -> tuple[str, dict[str, 
             viewpoint = trainer.viewpoint(scene.cameras[view].cam_from_world[:3], target)
             image = trainer.composited(None, trainer.look(viewpoint))
             every.append(target.colour(np.clip(image, 0, 1), settings.lambda_dssim).psnr)
-        scores[name] = float(np.mean(every))
+        scores[name] = float(np.mean(every)) if every else 0.0
     better = scores["camera"] >= scores["none"] + MARGIN
     return ("camera" if better else "none"), _tried_figures(scores)
 

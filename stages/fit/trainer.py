@@ -87,7 +87,9 @@ class Trainer:
         self.adam = Adam(self.packed.shape)
         self.rasterize: Callable[..., Any] = rasterize
         self.random = np.random.Generator(np.random.PCG64(self.settings.seed))
-        self.views = list(range(len(self.targets)))
+        # a view of which the mask leaves nothing has nothing to say, and no error
+        shown = [v for v, target in enumerate(targets) if target[1].colour.mask.any()]
+        self.views = shown or list(range(len(targets)))
         self.queue: list[int] = []
         self.iteration, self.iterations, self.haste = 0, settings.iterations, 1.0
         self.loss = self.psnr = 0.0
@@ -318,11 +320,11 @@ class Trainer:
             )
 
     def training_scores(self) -> tuple[Array, Array]:
-        """PSNR [V] in dB and SSIM [V] of every view at full size."""
+        """PSNR [V] in dB and SSIM [V] of every view that takes part, at full size."""
         results = []
-        for view, target in enumerate(self.targets):
+        for view in self.views:
             image = np.clip(self.composited(view, self.render(view)), 0, 1)
-            result = target[1].colour(image, self.settings.lambda_dssim)
+            result = self.targets[view][1].colour(image, self.settings.lambda_dssim)
             results.append((result.psnr, result.ssim))
         psnr, ssim = np.array(results).T
         return psnr, ssim

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,19 @@ def test_fit_improves_on_its_start_and_reports(tmp_path) -> None:
         image = render(here.result("gaussians"), refined[view.name], threads=1).image
         scores.append(-10 * np.log10(((np.clip(image, 0, 1) - view.image) ** 2).mean()))
     assert np.mean(scores) == pytest.approx(here.figures["train_psnr"], abs=0.05)
+
+
+@pytest.mark.parametrize("light", ["auto", "none"])
+def test_a_view_that_is_masked_wholly_has_no_part_in_the_scores(tmp_path, light) -> None:
+    views, cameras, points = case()
+    hidden = dataclasses.replace(views.views[0], mask=np.zeros((HEIGHT, WIDTH), bool))
+    masked = Views((hidden, *views.views[1:]))
+    here = context(tmp_path, masked, cameras, points, light=light, hold_surface=False)
+    last: dict[str, Any] = {}
+    here.on_progress = lambda step, done, total, **figures: last.update(figures)
+    FitStage().run(here)
+    assert 20 < here.figures["train_psnr"] < 40 and last["psnr"] < 40
+    assert all(value < 40 for name, value in here.figures.items() if "light_trial" in name)
 
 
 def test_harmonics_that_a_fit_does_not_come_to_are_not_in_the_scene(tmp_path) -> None:
