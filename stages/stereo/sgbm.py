@@ -52,10 +52,12 @@ def sgbm_depth(
     limits = np.sort([-shift * end + offset for end in ends])
     lowest = int(np.floor(limits[0])) - 2
     count = int(np.ceil((limits[1] + 2 - lowest) / SUBPIXEL)) * SUBPIXEL
-    if count > MOST_DISPARITIES or focal <= 0:
+    # what would match beyond the border is not asked for, and OpenCV refuses to be
+    room = (first.shape[1] - window // 2 - 1 - lowest) // SUBPIXEL * SUBPIXEL
+    if count > MOST_DISPARITIES or room < SUBPIXEL or focal <= 0:
         return np.zeros(gray.shape, np.float32)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest, numDisparities=count, blockSize=window,
+        minDisparity=lowest, numDisparities=min(count, room), blockSize=window,
         P1=8 * window**2, P2=32 * window**2, disp12MaxDiff=1, uniquenessRatio=5,
         speckleWindowSize=0, mode=cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip

@@ -75,6 +75,16 @@ def test_the_quick_preview_is_right_where_it_says_something():
     assert same(found, again)
 
 
+@pytest.mark.parametrize("angle", [25.0, 50.0])
+def test_the_quick_preview_of_views_whose_matches_are_partly_outside(angle):
+    cameras, images, depths, sparse = scene((-angle, 0.0, angle))
+    quick = replace(OPTIONS, method="sgbm")
+    found = dense_depths(images, everywhere(images), cameras, sparse, quick, 2, lambda *_: None)
+    for view, truth in zip(found, depths, strict=True):
+        assert (view.depth > 0).mean() > (0.1 if angle < 30 else -1)
+        assert not (view.depth > 0).any() or np.median(relative_error(view, truth)) < 0.012
+
+
 def test_the_quick_preview_of_views_above_each_other():
     """The scene turned by a quarter: rectified lines are columns."""
     cameras, images, depths, _ = scene((-6.0, 6.0))
