@@ -334,7 +334,6 @@ class InitConfig(StageConfig):
     upright: bool = Field(True, description="features without orientation: photos not rolled")
     peak_threshold: float = Field(0.002, gt=0, le=0.1, description="SIFT contrast threshold")
     max_features: int = Field(6000, ge=100, le=50_000, description="features per copy")
-    merge_radius: float = Field(1.2, ge=0, le=10, description="features this near are one, px")
     match_ratio: float = Field(0.88, gt=0, le=1, description="ratio test: best over next match")
     overlap_features: int = Field(800, ge=50, le=20_000, description="features per overlap test")
     overlap_matches: int = Field(80, ge=1, description="overlap from which plain features do")

@@ -126,9 +126,9 @@ def test_selected_pairs_are_each_views_best():
 
 
 def test_merged_points_share_the_first_one_nearby():
-    leaders = merge_points(np.array([[0, 0], [10, 0], [0.5, 0], [1.4, 0], [10, 1.0]]), 1.2)
+    leaders = merge_points(np.array([[0, 0], [10, 0], [0.5, 0], [1.4, 0], [10, 1.0]]))
     np.testing.assert_array_equal(leaders, [0, 1, 0, 3, 1])
-    assert merge_points(np.zeros((0, 2)), 1.0).shape == (0,)
+    assert merge_points(np.zeros((0, 2))).shape == (0,)
 
 
 @pytest.mark.parametrize("squeeze", [1.0, 0.5])
@@ -175,7 +175,7 @@ def test_copies_that_come_later_leave_the_indices_of_features_as_they_are():
     gray, everywhere = texture(), np.ones((160, 200), bool)
     whole = detect_features(gray, everywhere, squeezes=(1.0, 0.71, 0.5))
     plain = detect_features(gray, everywhere, squeezes=(1.0,))
-    both = joined(plain, detect_features(gray, everywhere, squeezes=(0.71, 0.5)), 1.2)
+    both = joined(plain, detect_features(gray, everywhere, squeezes=(0.71, 0.5)))
     np.testing.assert_array_equal(both.points, whole.points)
     np.testing.assert_array_equal(both.positions, whole.positions)
     np.testing.assert_array_equal(whole.plain().positions, plain.positions)

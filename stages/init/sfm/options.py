@@ -48,7 +48,6 @@ class ClassicalOptions:
     upright: bool = True
     peak_threshold: float = 0.002
     max_features: int = 6000
-    merge_radius: float = 1.2
     match_ratio: float = 0.88
     overlap_features: int = 800
     overlap_matches: int = 80

@@ -169,7 +169,7 @@ def reconstruct(
         for view, (gray, _), others in zip(turned, small, more, strict=True):
             height, width = grays[view].shape
             others = others.enlarged((width / gray.shape[1], height / gray.shape[0]))
-            features[view] = joined(features[view], others, options.merge_radius)
+            features[view] = joined(features[view], others)
         found |= match_pairs(features, far, options, pixel, threads, progress)
         return features, solver_of(found)
 
@@ -280,7 +280,7 @@ def find_features(
             features.append(
                 detect_features(
                     grays[view], valid[view],
-                    squeezes=options.squeezes, merge_radius=options.merge_radius, roll=rolls[view],
+                    squeezes=options.squeezes, roll=rolls[view],
                     described=found[number * count : (number + 1) * count],
                 )
             )  # fmt: skip

@@ -22,6 +22,8 @@ from pipeline.geometry.models.colmap import quiet_pycolmap
 
 #: Keypoints [K, 4] float32 (x, y, scale, orientation) and descriptors [K, 128] float32.
 Described = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+#: keypoints this near are one, in pixels: each copy shows a place a little aside
+SAME_PLACE = 1.2
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,6 @@ def detect_features(
     upright: bool = True,
     peak_threshold: float = 0.002,
     max_features: int = 6000,
-    merge_radius: float = 1.2,
     roll: float = 0.0,
     described: Sequence[Described] | None = None,
 ) -> Features:
@@ -91,7 +92,6 @@ def detect_features(
         upright: take the vertical as the keypoints' orientation (photographs that are not rolled).
         peak_threshold: contrast below which a keypoint is ignored.
         max_features: per copy, the largest are kept.
-        merge_radius: pixels within which keypoints count as the same place.
         roll: degrees by which the photograph is rolled clockwise; it is turned back first.
         described: what `describe` found on each of `copies_of`, if that has been done.
     """
@@ -121,7 +121,7 @@ def detect_features(
         descriptors=np.concatenate(descriptors),
         scales=np.concatenate(scales),
         squeezes=np.concatenate(levels),
-        points=merge_points(place, merge_radius),
+        points=merge_points(place),
         roll=roll,
     )
 
@@ -270,8 +270,8 @@ def describe(
     return result
 
 
-def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArray[np.int64]:
-    """For each of the positions [K, 2], the index of the first one within `radius` that leads.
+def merge_points(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """For each of the positions [K, 2], the index of the first one at the same place, which leads.
 
     Greedy in the order given: a position that no earlier leader has taken leads all that are free
     around it.
@@ -279,7 +279,7 @@ def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArr
     leader = np.full(len(positions), -1, np.int64)
     if len(positions) < 2:
         return np.arange(len(positions))
-    near = cKDTree(positions).query_pairs(radius, output_type="ndarray")
+    near = cKDTree(positions).query_pairs(SAME_PLACE, output_type="ndarray")
     near = near[np.lexsort((near[:, 1], near[:, 0]))]
     for first, second in near.tolist():
         if leader[first] < 0:
@@ -289,7 +289,7 @@ def merge_points(positions: npt.NDArray[np.float64], radius: float) -> npt.NDArr
     return np.where(leader < 0, np.arange(len(positions)), leader)
 
 
-def joined(first: Features, second: Features, merge_radius: float) -> Features:
+def joined(first: Features, second: Features) -> Features:
     """The features of one view with further ones behind them; those keep their indices."""
     positions = np.concatenate([first.positions, second.positions])
     return Features(
@@ -297,7 +297,7 @@ def joined(first: Features, second: Features, merge_radius: float) -> Features:
         descriptors=np.concatenate([first.descriptors, second.descriptors]),
         scales=np.concatenate([first.scales, second.scales]),
         squeezes=np.concatenate([first.squeezes, second.squeezes]),
-        points=merge_points(positions, merge_radius),
+        points=merge_points(positions),
         roll=first.roll,
     )
 
