@@ -350,9 +350,9 @@ class InitConfig(StageConfig):
         "auto", description="COLMAP's mapper; auto: incremental, global where views are left out"
     )
     max_reprojection_error: float = Field(
-        2.0, gt=0, le=50, description="beyond it an observation is dropped, px at 512 px width"
+        2.0, ge=0.1, le=50, description="beyond it an observation is dropped, px at 512 px width"
     )
-    min_tri_angle: float = Field(1.0, ge=0, le=45, description="least triangulation angle, degrees")
+    min_tri_angle: float = Field(1.0, gt=0, le=45, description="least triangulation angle, degrees")
     refinement: RefinementConfig = Field(
         RefinementConfig.model_validate({}), description="the last adjustment; rolled photographs"
     )

@@ -153,6 +153,8 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
         ("init.length.start=[true, 2]", "init.length.start=true is not allowed: it is a number"),
         ("init.squeezes=[1, 0]", "init.squeezes.1=0 is not allowed"),
         ("init.squeezes=[-1]", "init.squeezes.0=-1 is not allowed"),
+        ("init.min_tri_angle=0", "init.min_tri_angle=0 is not allowed"),
+        ("init.max_reprojection_error=0.01", "init.max_reprojection_error=0.01 is not allowed"),
         ("init.dense.window=4", "is not allowed: a window with a pixel in its middle is odd"),
         ("init.dense.polish_window=30", "is not allowed: a window with a pixel in its middle"),
     ],
