@@ -54,7 +54,7 @@ class SapStage(Stage):
     """Reduce the dense cloud to what a splat fit can use."""
 
     name = "sap"
-    version = 3
+    version = 4
     summary = "voxel downsampling, then scale-adaptive pruning of outliers"
     Config = SapConfig
     requires = ("points",)

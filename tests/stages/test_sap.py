@@ -54,6 +54,14 @@ def test_scale_is_the_root_mean_square_distance_to_three_neighbours():
     assert len(point_scales(positions[:0])) == 0
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_what_is_pruned_does_not_depend_on_the_unit_of_the_world(unit):
+    positions = np.random.default_rng(0).normal(size=(2000, 3)) / 100
+    scales = point_scales(positions)
+    np.testing.assert_allclose(point_scales(positions * unit), scales * unit, rtol=1e-5)
+    assert oversized(scales).sum() == 2
+
+
 def test_masks_follow_the_formula():
     scales = np.concatenate([np.full(996, 1.0), [2.0, 3.0, 5.0, 9.0]])
     assert oversized(scales, 0.999).nonzero()[0].tolist() == [999]
