@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from pipeline.artifacts.views import View, Views
 from stages.fit.config import FitConfig, FitSettings, resolve
 from stages.fit.inputs.scene import prepare
 from stages.fit.numerics.colours import bounded, deviation, solved
+from stages.fit.parts.camera import Exposure
 from stages.fit.parts.colours import Colours, slope_of
 from stages.fit.parts.light import Light
 from stages.fit.stage import FitStage
@@ -122,6 +125,17 @@ def test_slopes_are_those_of_what_is_seen() -> None:
 def test_exposures_count() -> None:
     fit = trainer(exposure=True, iterations=40)
     assert not np.allclose(slope_of(fit, 0), slope_of(fit, 2), atol=1e-5)
+
+
+def test_exposures_take_the_steps_of_their_own_photographs() -> None:
+    views, cameras, points = fit_case.case()
+    hidden = replace(views.views[1], mask=np.zeros((fit_case.HEIGHT, fit_case.WIDTH), bool))
+    some = (views.views[0], hidden, views.views[2])
+    s = settings(light="none", exposure=True, exposure_lr=0.01, iterations=2)
+    fit = prepare(some, cameras.cameras, points, None, s).trainer(s, False)
+    fit.run(None, lambda *_: None)
+    exposure = fit.find(Exposure)
+    assert exposure is not None and exposure.steps.tolist() == [1, 0, 1]
 
 
 def test_the_fit_says_that_it_did_and_can_do_without(tmp_path) -> None:

@@ -83,7 +83,7 @@ class Background(
         self.values = np.clip(self.values - move, 0, 1)
 
 
-class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "moments")):
+class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "moments", "steps")):
     """A gain and a bias per view and channel, so that exposure does not become geometry.
 
     Adam on them; their means over the views stay 1 and 0.
@@ -91,6 +91,7 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
     Attributes:
         values: [V, 2, 3] gain and bias.
         moments: [2, V, 2, 3].
+        steps: [V] of each view: some come later, and what is masked wholly never.
         before: [3, H, W] the image last shown, as the scene has it.
     """
 
@@ -105,6 +106,7 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
         super().__init__(fit)
         self.values = np.tile(np.array([[1.0], [0.0]]), (len(fit.targets), 1, 3))
         self.moments = np.zeros((2, *self.values.shape))
+        self.steps = np.zeros(len(fit.targets), np.int64)
         self.before: Floats = np.empty((3, 0, 0), np.float32)
 
     def show(self, view: int | None, image: Floats, transmittance: Floats) -> Floats:
@@ -115,15 +117,14 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
         return np.asarray(image * gain[:, None, None] + bias[:, None, None], np.float32)
 
     def compare(self, fit: Trainer, step: Step) -> None:
-        # the same number of steps for every view, to within one
-        steps = 1 + (fit.iteration - 1) // len(self.values)
+        self.steps[step.view] += 1
         d_image = step.d_planes[:3]
         gain = self.values[step.view, 0].astype(np.float32)
         by_gain = (d_image * self.before).sum((1, 2), dtype=np.float64)
         gradient = np.stack([by_gain, d_image.sum((1, 2), dtype=np.float64)])
         first, second = self.moments[:, step.view]
         move, *moments = numerics.moments.adam_step(
-            gradient, first, second, steps, self.settings.exposure_lr
+            gradient, first, second, int(self.steps[step.view]), self.settings.exposure_lr
         )
         self.moments[:, step.view] = moments
         self.values[step.view] -= move
