@@ -368,6 +368,10 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
     location = [
         str(part) if len(str(part)) <= _LONGEST_NAME else shown(part) for part in error["loc"]
     ]
+    why = error["msg"].removeprefix("Value error, ")
+    why = why.replace("Tuple", "List").replace("valid tuple", "valid list")
+    if error["type"] == "missing" and location[-1].isdigit():
+        location, why = location[:-1], "There are too few values"
     dotted = ".".join(filter(None, [section, *location]))
     if error["type"] == "extra_forbidden":
         if section not in stage_names():  # a suite, say: few enough to name them all
@@ -383,8 +387,7 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
         )
     about = _description(model, location)
     return (
-        f"{dotted}={shown(error.get('input'))} is not allowed: "
-        f"{error['msg'].removeprefix('Value error, ')}."
+        f"{dotted}={shown(error.get('input'))} is not allowed: {why}."
         f"{f' It means: {about}' if about else ''}"
     )
 

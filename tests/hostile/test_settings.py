@@ -153,6 +153,13 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
         ("init.length.start=[true, 2]", "init.length.start=true is not allowed: it is a number"),
         ("init.squeezes=[1, 0]", "init.squeezes.1=0 is not allowed"),
         ("init.squeezes=[-1]", "init.squeezes.0=-1 is not allowed"),
+        (
+            "fit.light_widths=[30]",
+            "fit.light_widths=[30] is not allowed: There are too few values.",
+        ),
+        ("fit.light_widths=[30, 20, 10]", "is not allowed: List should have at most 2 items"),
+        ("fit.light_widths=3", "Input should be a valid list"),
+        ("init.length.start=[1]", "init.length.start=[1] is not allowed: There are too few"),
         ("init.min_tri_angle=0", "init.min_tri_angle=0 is not allowed"),
         ("init.max_reprojection_error=0.01", "init.max_reprojection_error=0.01 is not allowed"),
         ("init.dense.window=4", "is not allowed: a window with a pixel in its middle is odd"),
