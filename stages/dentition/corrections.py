@@ -19,7 +19,13 @@ from pipeline.artifacts.dental.fdi import Jaw, is_upper
 from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
-from stages.dentition.crowns import centroid, mirrored_dentition, outline_of, with_outlines
+from stages.dentition.crowns import (
+    centroid,
+    mirrored_crown,
+    mirrored_dentition,
+    outline_of,
+    with_outlines,
+)
 from stages.dentition.parts import perhaps_one
 
 Array = npt.NDArray[np.float64]
@@ -105,10 +111,7 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
             "--set teeth.method=reader reads every one."
         )
     mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
-    if dentition.mirrored:  # places are pixels of the photograph as it was taken
-        dentition = mirrored_dentition(dentition)
-    if view.turned_over:
-        view = view.mirrored()
+    dentition, view = _as_taken(dentition, view)
     crowns = list(dentition.all_crowns)
     moved = False
     for k, change in enumerate(photo.crowns):
@@ -135,6 +138,44 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
         return replace(corrected, mirrored=mirrored)
     turned = mirrored_dentition(corrected)
     return replace(turned, kind=photo.kind or turned.kind)
+
+
+def _as_taken(dentition: Dentition, view: View) -> tuple[Dentition, View]:
+    """Both as the photograph was taken: places are pixels of that."""
+    return (
+        mirrored_dentition(dentition) if dentition.mirrored else dentition,
+        view.mirrored() if view.turned_over else view,
+    )
+
+
+def removed_crowns(
+    dentition: Dentition, view: View, photo: PhotoCorrection, mirrored: bool
+) -> list[tuple[Place, Crown | None]]:
+    """What a person has said to be no tooth.
+
+    Args:
+        dentition: as it was read from the photograph.
+        view: the photograph.
+        photo: what was said of it.
+        mirrored: the crowns are to be those of the picture turned over.
+
+    Returns:
+        For each removal the place that it names, and the crown there; None: none is read there.
+    """
+    dentition, view = _as_taken(dentition, view)
+    crowns, found = list(dentition.all_crowns), list[tuple[Place, Crown | None]]()
+    for change in photo.crowns:
+        crown = None
+        try:
+            index = _crown_at(crowns, view.working_place(change.at), change.at, "")
+            crown = crowns[index]
+            _change(crowns, index, change, view, "")
+        except RequestError:  # the next run says so
+            pass
+        if change.remove:
+            width = dentition.size[0]
+            found.append((change.at, mirrored_crown(crown, width) if crown and mirrored else crown))
+    return found
 
 
 def _change(

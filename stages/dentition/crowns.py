@@ -125,15 +125,17 @@ def mirrored_dentition(dentition: Dentition, said_too: bool = False) -> Dentitio
     return replace(
         dentition,
         kind={"right": "left", "left": "right"}.get(dentition.kind, dentition.kind),
-        upper=tuple(_mirrored_crown(c, width, said_too) for c in reversed(dentition.upper)),
-        lower=tuple(_mirrored_crown(c, width, said_too) for c in reversed(dentition.lower)),
+        upper=tuple(mirrored_crown(c, width, said_too) for c in reversed(dentition.upper)),
+        lower=tuple(mirrored_crown(c, width, said_too) for c in reversed(dentition.lower)),
         roll=-dentition.roll,
         on_jaws=moved_polygons(dentition.on_jaws, lambda polygon: _turned_over(polygon, width)),
         mirrored=True,
     )
 
 
-def _mirrored_crown(crown: Crown, width: int, said_too: bool) -> Crown:
+def mirrored_crown(crown: Crown, width: int, said_too: bool = False) -> Crown:
+    """A crown in the picture, so many pixels wide, turned over (see `mirrored_dentition`)."""
+
     def over(point: Array | None) -> Array | None:
         return None if point is None else np.array([width - point[0], point[1]])
 

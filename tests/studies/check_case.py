@@ -26,7 +26,7 @@ BEGIN = """<script>
   const deed = (text) => all("#panel button").find((entry) => entry.textContent.startsWith(text));
   const press = (key, more = {}) => document.activeElement.dispatchEvent(
     new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...more }));
-  const row = (k) => all(".chip", card(k)).map((entry) => entry.textContent);
+  const row = (k) => all(".chip:not(.gone)", card(k)).map((entry) => entry.textContent);
   const notes = (k) => card(k).querySelector(".notes").textContent;
 """
 SAVE = """

@@ -18,10 +18,10 @@ const make = (tag, given = {}, ...inside) => {
 let nextId = 0;
 const withId = (crown) => ({ ...crown, id: nextId++ });
 const photos = data.photographs.map((photo) => ({
-  ...photo, crowns: photo.crowns.map(withId), entries: photo.earlier.crowns,
+  ...photo, crowns: photo.crowns.map(withId), removed: photo.removed.map(withId), entries: photo.earlier.crowns,
   use: photo.earlier.use, kindSaid: photo.earlier.kind, mirroredSaid: photo.earlier.mirrored,
 }));
-const changing = ["crowns", "entries", "use", "kindSaid", "kind", "mirrored",
+const changing = ["crowns", "removed", "entries", "use", "kindSaid", "kind", "mirrored",
   "mirroredSaid", "roll"];
 const past = [];
 let saved = yamlOf(photos);
@@ -105,13 +105,25 @@ const remove = () => {
   const row = rowOf(photo, crown.jaw);
   const at = row.indexOf(crown);
   change(() => {
-    photo.entries = [...photo.entries,
-      { at: original(photo, innerPoint(crown.outline)), remove: true }];
+    const entry = { at: original(photo, innerPoint(crown.outline)), remove: true };
+    photo.entries = [...photo.entries, entry];
+    photo.removed = [...photo.removed, { ...crown, at: entry.at }];
     photo.crowns = photo.crowns.filter((other) => other !== crown);
     const near = row[at + 1] ?? row[at - 1];
     chosen = near ? { photo, id: near.id } : null;
   });
   say("Removed: it is no tooth.");
+};
+const bringBack = (photo, { at, ...crown }) => {
+  change(() => {
+    const index = photo.entries.findIndex((entry) => entry.remove && String(entry.at) === String(at));
+    photo.entries = photo.entries.filter((_, k) => k !== index);
+    photo.removed = photo.removed.filter((other) => other.id !== crown.id);
+    if (!crown.outline.length) return;
+    photo.crowns = [...photo.crowns, crown];
+    if (isUsed(photo)) chosen = { photo, id: crown.id };
+  });
+  say("Brought back.");
 };
 const turnOver = (photo) => {
   change(() => {
@@ -119,10 +131,12 @@ const turnOver = (photo) => {
     photo.mirroredSaid = photo.mirrored;
     photo.roll = -photo.roll;
     photo.kind = { right: "left", left: "right" }[photo.kind] ?? photo.kind;
-    photo.crowns = photo.crowns.map((crown) => ({ ...crown,
-      outline: crown.outline.map(([x, y]) => [photo.width - x, y]),
-      number: crown.number && crown.doubt ? otherSide(crown.number) : crown.number,
-      offered: crown.offered.map(([tooth, share]) => [otherSide(tooth), share]) }));
+    for (const kind of ["crowns", "removed"]) {
+      photo[kind] = photo[kind].map((crown) => ({ ...crown,
+        outline: crown.outline.map(([x, y]) => [photo.width - x, y]),
+        number: crown.number && crown.doubt ? otherSide(crown.number) : crown.number,
+        offered: crown.offered.map(([tooth, share]) => [otherSide(tooth), share]) }));
+    }
   });
   say(photo.mirrored ? `${photo.name} is taken as a mirror image and turned over.`
     : `${photo.name} is taken as it is.`);

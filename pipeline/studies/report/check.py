@@ -37,6 +37,10 @@ DIGITS = 16
 #: Numbers offered for a crown.
 MOST_OFFERED = 5
 _NOTHING = ("no teeth were found in it", "its teeth have not been read")
+#: Of a removed crown that is not read any more.
+_NO_CROWN: Content = {
+    "jaw": "upper", "outline": [], "number": 0, "doubt": 1.0, "weak": False, "offered": [],
+}  # fmt: skip
 #: The setting that names a file of corrections.
 LABELS = "init.dental.labels"
 
@@ -61,7 +65,7 @@ def write_check_page(case: Case) -> bool:
     own = path is None or path.parent.resolve() == case.workspace.resolve()
     write_page(
         "pipeline.studies.report", TEMPLATE, out, title=case.workspace.resolve().name,
-        data=content(teeth, views, corrections)
+        data=content(teeth, views, corrections, case.load("teeth", "teeth"))
         | {"command": command(case), "target": "" if own else str(path)},
         failure=(case.failed.failure or "").partition(PICTURES)[0]
         if case.failed else "",
@@ -89,9 +93,18 @@ def _corrections(case: Case) -> tuple[Path | None, Corrections, str]:
         return path, Corrections(), str(error)
 
 
-def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
-    """What the page's script works on, as JSON values."""
-    by_name = teeth.by_name()
+def content(
+    teeth: Teeth, views: Views, corrections: Corrections, read: Teeth | None = None
+) -> Content:
+    """What the page's script works on, as JSON values.
+
+    Args:
+        teeth: as the last run left them.
+        views: the photographs.
+        corrections: what was put right before.
+        read: the teeth as the photographs have them; None: not known.
+    """
+    by_name, as_read = teeth.by_name(), read.by_name() if read else {}
     earlier = corrections.photographs
     photographs = []
     for view in views.views:
@@ -103,14 +116,25 @@ def content(teeth: Teeth, views: Views, corrections: Corrections) -> Content:
         said = earlier.get(label, PhotoCorrection())
         if not said.is_of(view.source_sha256):
             said = PhotoCorrection()
-        photographs.append(_photograph(view, seen, label, said))
+        before = as_read.get(view.name) or Dentition(view.name, seen.size, "none")
+        photographs.append(_photograph(view, seen, before, label, said))
     digest = hashlib.sha256(json.dumps(photographs).encode()).hexdigest()
     return {
         "file": CORRECTIONS, "doubtful": DOUBTFUL, "photographs": photographs, "digest": digest,
     }  # fmt: skip
 
 
-def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrection) -> Content:
+def _photograph(
+    view: View, seen: Dentition, read: Dentition, label: str, earlier: PhotoCorrection
+) -> Content:
+    from stages.dentition.corrections import removed_crowns
+
+    removed = [
+        {"at": list(at)} | (_crown(crown) if crown else _NO_CROWN)
+        for at, crown in removed_crowns(read, view, earlier, bool(seen.mirrored))
+    ]
+    gone = [crown["outline"] for crown in removed]
+    crowns = [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3]
     shown = picture(
         to_uint8(view.image), label, long_side=LARGE if seen.all_crowns else SMALL
     )  # fmt: skip
@@ -128,7 +152,8 @@ def _photograph(view: View, seen: Dentition, label: str, earlier: PhotoCorrectio
         "kind": seen.kind,
         "aside": seen.set_aside or ("" if seen.all_crowns else _NOTHING[seen.kind == UNREAD]),
         "doubts": list(seen.doubts),
-        "crowns": [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3],
+        "crowns": [crown for crown in crowns if crown["outline"] not in gone],
+        "removed": removed,
         "earlier": _entries(earlier),
     }
 

@@ -3,7 +3,8 @@
 
 const pictureOf = (photo) => {
   const [w, h] = [photo.width, photo.height];
-  const boxes = photo.crowns.map((crown) => extent(crown.outline));
+  const boxes = [...photo.crowns, ...photo.removed.filter(({ outline }) => outline.length)]
+    .map((crown) => extent(crown.outline));
   const low = [0, 1].map((axis) => Math.min(...boxes.map((box) => box[axis])));
   const high = [0, 1].map((axis) => Math.max(...boxes.map((box) => box[axis + 2])));
   const margin = 0.12 * Math.max(high[0] - low[0], high[1] - low[1]);
@@ -91,18 +92,44 @@ const marks = (photo, crown, wrong) => [`q${quadrantOf(crown.number)}`,
   chosen?.id === crown.id ? "chosen" : ""].join(" ");
 const label = (crown) => (crown.number
   ? `${crown.number}${crown.doubt >= data.doubtful ? "?" : ""}` : "?");
+// What a removed crown was: its number, or what it looks like.
+const goneLabel = (crown) => (crown.number || !crown.offered.length ? label(crown)
+  : `${crown.offered[0][0]}?`);
+const goneDescribed = (crown) => {
+  const tooth = crown.number || crown.offered[0]?.[0];
+  const what = !crown.outline.length ? "nothing is read there any more" : !tooth ? `${crown.jaw} crown`
+    : `${crown.number ? "" : "looks like "}${nameOf(tooth)}`;
+  return `${goneLabel(crown)} bring back: removed, ${what}`;
+};
+const removedRow = (photo) => {
+  const button = (crown) => {
+    const point = ({ type }) => cards.get(photo)?.crowns.querySelector(`[data-id="${crown.id}"]`)
+      ?.classList.toggle("pointed", ["focus", "pointerenter"].includes(type));
+    return make("button", { type: "button", class: "chip q0 gone", "aria-label": goneDescribed(crown),
+      onfocus: point, onblur: point, onpointerenter: point, onpointerleave: point,
+      onclick: () => bringBack(photo, crown) }, make("s", {}, goneLabel(crown)), " bring back");
+  };
+  return photo.removed.length ? make("div", {}, make("span", { class: "what" }, "no tooth"),
+    make("div", { class: "chips", role: "group", "aria-label": "removed" },
+      ...photo.removed.map(button))) : null;
+};
 const drawCrowns = (photo, card) => {
   const wrong = new Set(problemsOf(photo).flatMap((problem) => problem.crowns));
   const shown = [...photo.crowns].sort((a, b) => (a.id === chosen?.id) - (b.id === chosen?.id));
   const mean = photo.crowns.reduce((sum, crown) => sum + Math.sqrt(areaOf(crown.outline)), 0)
     / Math.max(1, photo.crowns.length);
-  card.crowns.replaceChildren(...shown.map((crown) => {
+  const drawn = (crown, kind, text) => {
     const [x, y] = innerPoint(crown.outline);
-    const size = Math.min(0.36 * mean, 0.46 * Math.sqrt(areaOf(crown.outline)));
-    return make("g", { class: `crown ${marks(photo, crown, wrong)}`, "data-id": crown.id },
+    const area = areaOf(crown.outline);
+    const size = Math.min(0.36 * (mean || Math.sqrt(area)), 0.46 * Math.sqrt(area));
+    return make("g", { class: kind, "data-id": crown.id },
       make("polygon", { points: crown.outline.map((at) => at.join(",")).join(" ") }),
-      make("text", { x, y, "font-size": size }, label(crown)));
-  }));
+      make("text", { x, y, "font-size": size }, text));
+  };
+  card.crowns.replaceChildren(
+    ...photo.removed.filter(({ outline }) => outline.length)
+      .map((crown) => drawn(crown, "gone", goneLabel(crown))),
+    ...shown.map((crown) => drawn(crown, `crown ${marks(photo, crown, wrong)}`, label(crown))));
   if (cut && chosen.photo === photo) {
     const [[x1, y1], [x2, y2]] = [cut.from, cut.to];
     card.crowns.append(make("line", { class: "cut", x1, y1, x2, y2 }));
@@ -133,7 +160,7 @@ const drawCard = (photo) => {
     ...photo.doubts.map((text) => make("p", { class: "doubt" }, sentence(text))));
   const first = photo.crowns.some((crown) => crown.id === chosen?.id) ? null
     : [...rowOf(photo, "upper"), ...rowOf(photo, "lower")][0];
-  card.rows.replaceChildren(...["upper", "lower"].map((jaw) => {
+  const rows = ["upper", "lower"].map((jaw) => {
     const row = rowOf(photo, jaw);
     return make("div", {}, make("span", { class: "what" }, jaw),
       make("div", { class: "chips", role: "group", "aria-label": `${jaw} row, left to right` },
@@ -143,7 +170,8 @@ const drawCard = (photo) => {
           tabindex: chosen?.id === crown.id || first === crown ? 0 : -1,
           onclick: () => choose(photo, crown.id),
         }, label(crown)))));
-  }));
+  });
+  card.rows.replaceChildren(...[...rows, removedRow(photo)].filter(Boolean));
 };
 
 const drawRest = (panel) => {
@@ -244,7 +272,7 @@ const left = photos.filter((photo) => !isUsed(photo));
     make("img", { src: photo.picture, alt: `Photograph ${photo.name}, left out.` }),
     make("figcaption", {}, make("b", {}, photo.name), make("br"), photo.aside || "left out by you"),
     photo.crowns.length ? make("button", { type: "button", onclick: () => useIt(photo, true) },
-      "Use it") : null)));
+      "Use it") : removedRow(photo))));
   find("undo").setAttribute("aria-disabled", String(!past.length));
   // Where the focus was on the crown, it is on its chip; else it stays where it was. What has gone
   // or can't be pressed any more leaves it to what takes that back.
