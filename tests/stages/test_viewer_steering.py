@@ -31,6 +31,15 @@ STEADY = """(async () => {
   result.within = closed(() => $("ask").click(), () => $("close").click());
   escape();
   result.end = at();
+  press("n");
+  $("more").focus();
+  const box = canvas.getBoundingClientRect();
+  click(box.width / 2, box.height / 2);
+  const lifted = new Event("touchend", { cancelable: true });
+  canvas.dispatchEvent(lifted);
+  result.tapped = [document.activeElement.ariaLabel, lifted.defaultPrevented];
+  click(5, 5);
+  result.touched = at();
   tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
 })();"""
 
@@ -45,6 +54,8 @@ def test_the_focus_goes_back_where_it_was(tmp_path: Path) -> None:
     assert found["button"] == ["done", "more"]
     assert found["within"] == ["close", "jaw"]
     assert found["end"] == "more"
+    assert found["tapped"] == ["Note 1", True], "a browser's mouse would press the scene after it"
+    assert found["touched"] == "canvas"
 
 
 PACE = """(async () => {

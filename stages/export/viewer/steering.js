@@ -21,6 +21,7 @@ function addPointers(screen, tapped = () => {}, zooms = () => true) {
   canvas.addEventListener("pointerdown", (event) => {
     still = pointers.size === 0 && event.button <= 0 ? [event.clientX, event.clientY] : null;
     canvas.setPointerCapture(event.pointerId);
+    canvas.focus({ preventScroll: true });
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     screen.stopTurning();
     screen.held = true;
@@ -54,6 +55,8 @@ function addPointers(screen, tapped = () => {}, zooms = () => true) {
       screen.wake(false);
     });
   }
+  // After a tap browsers act as if a mouse had been pressed: the focus would leave a note just begun.
+  canvas.addEventListener("touchend", (event) => event.cancelable && event.preventDefault());
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     if (!zooms()) return;
