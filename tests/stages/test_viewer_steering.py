@@ -1,8 +1,10 @@
-"""The viewer page in hand: where the focus goes, how finely it moves, keys, a lost context."""
+"""The viewer page in hand: where the focus goes, how finely it moves, keys, small windows."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+import pytest
 
 from tests.browser import needs_chromium, run_in
 from tests.stages.viewer_case import HEAD, ball_page
@@ -56,6 +58,35 @@ def test_the_focus_goes_back_where_it_was(tmp_path: Path) -> None:
     assert found["end"] == "more"
     assert found["tapped"] == ["Note 1", True], "a browser's mouse would press the scene after it"
     assert found["touched"] == "canvas"
+
+
+SMALL = """(async () => {
+  await page.ready;
+  const inside = (element) => {
+    const { left, right, top, bottom } = element.getBoundingClientRect();
+    return Math.min(left, top, innerWidth - right, innerHeight - bottom) > -1;
+  };
+  const buttons = [...$("bar").querySelectorAll("button, input")];
+  const reached = buttons.filter((button) => { button.focus(); return inside(button); });
+  const bar = $("bar").getBoundingClientRect();
+  press("h");
+  const help = [$("help").scrollTop, inside(document.activeElement), inside($("help-title"))];
+  tell({ missed: buttons.length - reached.length, help, share: bar.height / innerHeight,
+    count: buttons.length, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+@pytest.mark.parametrize("size", [(320, 640), (320, 200), (844, 390)])
+def test_small_windows_have_room_for_everything(tmp_path: Path, size: tuple[int, int]) -> None:
+    """Phones; and a window of 1280 by 800 that is enlarged four times."""
+    found, log = run_in(
+        ball_page(), HEAD + SMALL, tmp_path, size, address="#still", framed=True, coarse=True
+    )
+    assert (found["errors"], log) == ("", [])
+    assert found["count"] > 8 and found["missed"] == 0
+    assert found["share"] < 0.5, "the scene is seen as well"
+    assert found["help"] == [0, True, True], "help begins at its beginning"
 
 
 PACE = """(async () => {
