@@ -1,9 +1,10 @@
-"""The viewer page in hand: where the focus goes, how finely it moves, keys, small windows."""
+"""The viewer page in hand: the focus, how finely it moves, keys, small windows, paper."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.browser import needs_chromium, run_in
@@ -87,6 +88,50 @@ def test_small_windows_have_room_for_everything(tmp_path: Path, size: tuple[int,
     assert found["count"] > 8 and found["missed"] == 0
     assert found["share"] < 0.5, "the scene is seen as well"
     assert found["help"] == [0, True, True], "help begins at its beginning"
+
+
+PAPER = """(async () => {
+  await page.ready;
+  press("u");
+  press("t");
+  press("p");
+  await new Promise((done) => setTimeout(done, 300));
+  requestAnimationFrame = () => 0;  // nothing is drawn anew on its way to the printer
+  const box = (element) => element.getBoundingClientRect();
+  const places = () => [...document.querySelectorAll("#drawing .number, #photo")].map((element) => {
+    const [{ x, y, width, height }, whole] = [box(element), box(canvas)];
+    return [(x + width / 2 - whole.x) / whole.width, (y + height / 2 - whole.y) / whole.height];
+  });
+  const shape = () => box(canvas).width / box(canvas).height;
+  const result = { screen: [places(), shape()] };
+  const rules = [...document.styleSheets].flatMap((sheet) => [...sheet.cssRules]);
+  rules.find(({ media }) => media?.mediaText === "print").media.mediaText = "all";
+  const under = () => box($("tools")).top - box(canvas).bottom;
+  result.sheets = [];
+  for (const [width, height] of [[740, 980], [980, 740]]) {
+    await resized(width, height);
+    result.sheets.push([places(), shape(), under() >= 0, box(canvas).bottom <= height]);
+  }
+  result.shown = ["bar", "distance", "copy", "measured"]
+    .filter((id) => $(id).getClientRects().length);
+  result.ink = getComputedStyle($("measured")).color;
+  tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+@pytest.mark.parametrize("size", [(640, 480), (390, 780)])
+def test_on_paper_numbers_stand_on_their_teeth(tmp_path: Path, size: tuple[int, int]) -> None:
+    found, log = run_in(ball_page(), HEAD + PAPER, tmp_path, size, address="#still", framed=True)
+    assert (found["errors"], log) == ("", [])
+    places, shape = found["screen"]
+    assert len(places) == 3
+    for sheet, its_shape, under, whole in found["sheets"]:
+        assert np.allclose(sheet, places, atol=0.01)
+        assert its_shape == pytest.approx(shape, rel=0.01), "the teeth keep their proportions"
+        assert under and whole
+    assert found["shown"] == ["measured"]
+    assert found["ink"] == "rgb(0, 0, 0)"
 
 
 PACE = """(async () => {

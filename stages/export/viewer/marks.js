@@ -24,8 +24,11 @@ class Marks {
   /** @param {{pose: Pose, left: number}[]} panes */
   draw(panes) {
     const { canvas, store, scene } = this.viewer;
+    const { clientWidth: width, clientHeight: height } = canvas;
     this.drawing.replaceChildren();
-    this.scale = canvas.clientWidth / canvas.width;
+    this.drawing.setAttribute("viewBox", `0 0 ${width} ${height}`);  // on paper it has another size
+    byId("stage").style.setProperty("--shape", width / height);
+    this.scale = width / canvas.width;
     for (const pane of panes) {
       if (store.now.numbers !== "off") this.#numbers(pane);
       for (const mark of store.now.marks) this.#mark(pane, mark);

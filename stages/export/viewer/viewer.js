@@ -147,9 +147,9 @@ class Viewer extends Screen {
     const share = alone ? Number(byId("opacity").value) / 100 : 0;
     photo.style.opacity = share;
     if (!pose.frame || share === 0) return;
-    const scale = this.canvas.clientWidth / pose.width;
-    for (const side of ["left", "top", "width", "height"]) {
-      photo.style[side] = `${pose.frame[side] * scale}px`;
+    for (const [side, whole] of
+      [["left", pose.width], ["top", pose.height], ["width", pose.width], ["height", pose.height]]) {
+      photo.style[side] = `${100 * pose.frame[side] / whole}%`;
     }
   }
 
