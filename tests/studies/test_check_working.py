@@ -129,6 +129,28 @@ def test_changes_are_there_when_the_page_is_opened_again(tmp_path: Path) -> None
 
 
 @needs_chromium
+def test_a_browser_that_lets_nothing_be_copied_is_believed(tmp_path: Path) -> None:
+    copying = """
+  const copy = (clipboard) => {
+    Object.defineProperty(navigator, "clipboard", { value: clipboard, configurable: true });
+    const button = all("#next li button")[0];
+    button.click();
+    return wait().then(() => [button.textContent, `${getSelection()}`.slice(0, 12)]);
+  };
+  result.copies = [
+    await copy({ writeText: () => Promise.reject(new DOMException("no", "NotAllowedError")) }),
+    await copy(undefined),
+    await copy({ writeText: async (text) => { result.copied = text; } }),
+  ];
+"""
+    result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", SAVE, copying)
+    refused = ["Not allowed: copy what is marked", "pipeline run"]
+    assert result["copies"][:2] == [refused, refused]
+    assert result["copies"][2][0] == "Copied"
+    assert result["copied"].startswith("pipeline run -w ")
+
+
+@needs_chromium
 def test_a_browser_that_keeps_nothing_is_no_error(tmp_path: Path) -> None:
     refused = """
   Object.defineProperty(window, "localStorage",

@@ -319,8 +319,13 @@ const save = async () => {
   const quote = /^[\w./+:-]+$/.test(place) ? place : `'${place.replaceAll("'", "'\\''")}'`;
   const command = [data.command[0], quote || "WORKSPACE", data.command[1]].join(" ").trim();
   const copy = make("button", { type: "button", onclick: async () => {
-    await navigator.clipboard?.writeText(command).catch(() => {});
-    copy.textContent = "Copied";
+    try {
+      await navigator.clipboard.writeText(command);
+      copy.textContent = "Copied";
+    } catch {
+      getSelection().selectAllChildren(find("next").querySelector("pre"));
+      copy.textContent = "Not allowed: copy what is marked";
+    }
   } }, "Copy");
   find("next").replaceChildren(
     make("b", {}, `${data.file} is ${how}. Two steps to go:`),
