@@ -87,12 +87,13 @@ function noteText(text) {
 function marksIn(link, limits) {
   const texts = link.getAll("text");
   const marks = [];
-  for (const kind of Object.keys(LETTERS)) {
-    link.getAll(LETTERS[kind]).slice(0, MOST_MARKS).forEach((value, index) => {
-      const places = value.split(";").slice(0, 4).map((text) => placeIn(text, limits));
-      if (places.length !== PLACES_OF[kind] || places.some((place) => !place)) return;
-      marks.push({ kind, places, ...(kind === "note" && { text: noteText(texts[index] ?? "") }) });
-    });
+  for (const [letter, value] of link) {
+    const kind = Object.keys(LETTERS).find((name) => LETTERS[name] === letter);
+    if (!kind) continue;
+    const text = kind === "note" && noteText(texts.shift() ?? "");
+    const places = value.split(";").slice(0, 4).map((place) => placeIn(place, limits));
+    if (places.length !== PLACES_OF[kind] || places.some((place) => !place)) continue;
+    marks.push({ kind, places, ...(kind === "note" && { text }) });
   }
   return marks.slice(0, MOST_MARKS);
 }

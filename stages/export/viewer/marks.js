@@ -56,12 +56,13 @@ class Marks {
     const { scene, store } = this.viewer;
     const eye = centreOf(pane.pose.rotation, pane.pose.translation);
     const { viewer } = this;
+    const { cut } = viewer.shownParts();
     const moving = viewer.held || viewer.motion || viewer.turning;
     const hidden = moving ? [] : covered(
       viewer.splats, pane.pose, scene.teeth.map(({ centre }) => centre),
       BEFORE * scene.orbiting.radius, viewer.shownParts());
     for (const [index, tooth] of scene.teeth.entries()) {
-      if (hidden[index]) continue;
+      if (hidden[index] || dot(cut, tooth.centre) > cut[3]) continue;
       if (store.now.jaw !== "both" && store.now.jaw !== tooth.jaw) continue;
       if (dot(unit(minus(eye, tooth.centre)), tooth.towards) < FACING) continue;
       const at = this.#at(pane, tooth.centre);

@@ -25,8 +25,8 @@ function angleOf([a, b, c]) {
   const cosine = clamp(dot(u, v), -1, 1);
   const sine = Math.max(Math.sqrt(1 - cosine ** 2), 1e-3);
   // How the angle changes with each of its ends, and against both with its corner.
-  const byFirst = scaled(minus(scaled(u, cosine), v), 1 / (sine * (Math.hypot(...first) || 1)));
-  const bySecond = scaled(minus(scaled(v, cosine), u), 1 / (sine * (Math.hypot(...second) || 1)));
+  const byFirst = scaled(minus(scaled(u, cosine), v), 1 / (sine * (Math.hypot(...first) || 1e-9)));
+  const bySecond = scaled(minus(scaled(v, cosine), u), 1 / (sine * (Math.hypot(...second) || 1e-9)));
   const variance = varianceAlong(a, byFirst) + varianceAlong(c, bySecond)
     + varianceAlong(b, plus(byFirst, bySecond));
   const degrees = 180 / Math.PI;

@@ -20,6 +20,9 @@ class Tools {
     this.viewer = viewer;
     this.store = viewer.store;
     this.store.listeners.push(() => viewer.wake(false));
+    for (const kind of ["focus", "blur"]) {  // the crosshair comes and goes
+      viewer.canvas.addEventListener(kind, () => viewer.wake(false));
+    }
   }
 
   say(text) {
@@ -129,6 +132,10 @@ class Tools {
     const place = pick(splats, scene.format, spot.pose, spot.x, spot.y, this.viewer.shownParts());
     if (!place) {
       this.tell("There is no surface at this point.");
+      return;
+    }
+    if (pending.some(({ point }) => Math.hypot(...minus(point, place.point)) === 0)) {
+      this.tell("This point is chosen already; choose another one.");
       return;
     }
     const places = [...pending, place];
