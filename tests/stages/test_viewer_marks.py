@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from tests.browser import needs_chromium, run_in
 from tests.stages.viewer_case import HEAD, ball_page
 
@@ -102,3 +104,67 @@ def test_what_is_drawn_is_of_what_is_there(tmp_path: Path) -> None:
         "off: 11 41", "height: 41", "depth: ", "across: 11 41", "off: 11 41",
     ], "no numbers of teeth that are cut away"  # fmt: skip
     assert found["crosshair"] == [True, False, True], "it is there while the keys are the scene's"
+
+
+SAVED = """(async () => {
+  await page.ready;
+  let blob = null;
+  URL.createObjectURL = (given) => { blob = given; return "blob:x"; };
+  HTMLAnchorElement.prototype.click = () => {};
+  const saved = async () => {
+    blob = null;
+    press("s");
+    while (!blob) {
+      await new Promise((done) => setTimeout(done, 50));
+      page.render();  // virtual time would be over before the picture is there
+    }
+    const { width, height } = canvas;
+    const brush = Object.assign(document.createElement("canvas"), { width, height })
+      .getContext("2d");
+    brush.drawImage(await createImageBitmap(blob), 0, 0);
+    const picture = brush.getImageData(0, 0, width, height).data;
+    const scene = page.pixels();
+    let [off, left, right, top, bottom] = [0, width, 0, height, 0];
+    for (let k = 0; k < scene.length; k += 4) {
+      if ([0, 1, 2].every((c) => Math.abs(scene[k + c] - picture[k + c]) < 60)) continue;
+      const [x, y] = [k / 4 % width, Math.floor(k / 4 / width)];
+      [off, left, right] = [off + 1, Math.min(left, x), Math.max(right, x)];
+      [top, bottom] = [Math.min(top, y), Math.max(bottom, y)];
+    }
+    const scale = canvas.clientWidth / width;
+    return [off, [left, top, right + 1, bottom + 1].map((edge) => edge * scale)];
+  };
+  const result = {};
+  press("m");
+  canvas.focus();
+  result.bare = await saved();
+  press("u");
+  result.numbers = await saved();
+  page.render();
+  const boxes = [...document.querySelectorAll("#drawing .number")]
+    .map((number) => number.getBoundingClientRect());
+  result.where = [Math.min(...boxes.map(({ left }) => left)), Math.min(...boxes.map((b) => b.top)),
+    Math.max(...boxes.map((b) => b.right)), Math.max(...boxes.map((b) => b.bottom))];
+  press("u"); press("u");
+  press("2");
+  page.setBackground([1, 1, 1]);
+  press("p");
+  await new Promise((done) => setTimeout(done, 300));
+  page.render();
+  const { left, top, right, bottom } = $("photo").getBoundingClientRect();
+  result.photo = [await saved(), [left, top, right, bottom]];
+  tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_what_is_saved_is_what_is_seen(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(), HEAD + SAVED, tmp_path, (640, 480), address="#still")
+    assert (found["errors"], log) == ("", [])
+    assert found["bare"][0] == 0, "the crosshair is no part of the picture"
+    count, box = found["numbers"]
+    assert count > 100
+    assert np.allclose(box, found["where"], atol=6), "numbers are in it where they are on screen"
+    (count, box), where = found["photo"]
+    assert count > 20_000, "the photograph lies over the scene"
+    assert np.allclose(box, where, atol=2)

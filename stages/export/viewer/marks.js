@@ -43,6 +43,23 @@ class Marks {
     if (store.now.tool !== "turn") this.#crosshair();
   }
 
+  /** What is drawn, but for the crosshair, as an image with the rules of the page's style. */
+  async picture(width, height) {
+    const drawing = this.drawing.cloneNode(true);
+    drawing.querySelectorAll("path").forEach((path) => path.remove());
+    const rules = [...document.styleSheets].flatMap((sheet) => [...sheet.cssRules])
+      .filter(({ selectorText }) => selectorText?.startsWith("#drawing "));
+    const style = document.createElementNS(SVG, "style");
+    style.textContent = `svg { font-family: system-ui, sans-serif; } ${rules.map((rule) => rule.cssText).join(" ")}`;
+    drawing.append(style);
+    drawing.setAttribute("width", width);
+    drawing.setAttribute("height", height);
+    const image = new Image();
+    image.src = `data:image/svg+xml,${encodeURIComponent(new XMLSerializer().serializeToString(drawing))}`;
+    await image.decode();
+    return image;
+  }
+
   /** A point of the world in pixels of the page, or null behind the camera or outside its pane. */
   #at({ pose, left }, point) {
     const p = plus(applied(pose.rotation, point), pose.translation);

@@ -234,9 +234,23 @@ class Viewer extends Screen {
     this.wake(false);
   }
 
-  save() {
+  /** What is seen as a PNG: the scene, the photograph over it, numbers and marks. */
+  async save() {
     this.render();
-    this.canvas.toBlob((blob) => {
+    const { width, height } = this.canvas;
+    const paper = Object.assign(document.createElement("canvas"), { width, height });
+    const brush = paper.getContext("2d");
+    brush.drawImage(this.canvas, 0, 0);
+    const photo = byId("photo");
+    const share = Number(photo.style.opacity);
+    if (share > 0) {
+      const { left, top, width: wide, height: high } = this.panes()[0].pose.frame;
+      brush.globalAlpha = share;
+      brush.drawImage(photo, left, top, wide, high);
+      brush.globalAlpha = 1;
+    }
+    brush.drawImage(await this.marks.picture(width, height), 0, 0, width, height);
+    paper.toBlob((blob) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(blob);
       link.download = "dentalsplat.png";
