@@ -20,8 +20,15 @@ TWICE = """(async () => {
   result.told = [$("told").textContent, page.state.pending.length];
   at(.55, .4); at(.5, .4); at(.55, .45);
   result.angle = texts();
-  press("Escape");
+  press("n");
+  at(.5, .42);
+  const note = document.activeElement;
+  result.note = [true, false].map((isComposing) => {
+    press("Enter", note, { isComposing });
+    return document.activeElement === note;
+  });
   const place = "0,0,-1,0,0,1,.01,.01,3";
+  press("Delete");
   location.hash = `a=${place};${place};.2,0,-1,0,0,1,.01,.01,3`;
   await new Promise((done) => setTimeout(done, 300));
   result.link = texts();
@@ -37,6 +44,7 @@ def test_the_same_point_twice_is_no_measurement(tmp_path: Path) -> None:
     assert (found["errors"], log) == ("", [])
     assert found["told"] == ["This point is chosen already; choose another one.", 1]
     assert len(found["angle"]) == 1 and "± 180°" not in found["angle"][0]
+    assert found["note"] == [True, False], "Enter ends a note, but not while its signs are chosen"
     assert found["link"] == ["Angle 90° ± 180°"], "there is no angle at a corner without a side"
 
 

@@ -25,7 +25,8 @@ function listMarks(tools, now, before) {
       field.placeholder = "Write the note";
       field.setAttribute("aria-label", `Note ${index + 1}`);
       field.addEventListener("change", () => tools.setNote(index, field.value));
-      field.addEventListener("keydown", (event) => event.key === "Enter" && field.blur());
+      field.addEventListener("keydown", (event) =>  // Enter may also choose among signs to write
+        event.key === "Enter" && !event.isComposing && field.blur());
       item.append(field);
     } else {
       const text = document.createElement("span");
