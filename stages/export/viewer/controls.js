@@ -73,8 +73,9 @@ function addButtons(viewer) {
   byId("opacity").addEventListener("input", (event) => showPhoto(viewer, event.target.value));
   byId("compare").hidden = !viewer.scene.views.some((view) => view.photo);
   byId("full").hidden = !root.requestFullscreen;
-  byId("bar").addEventListener("focusin", ({ target }) =>
-    target.scrollIntoView({ block: "nearest", inline: "nearest" }));
+  byId("bar").addEventListener("focusin", ({ target }) => {  // what is pressed must not move away
+    if (target.matches(":focus-visible")) target.scrollIntoView({ block: "nearest", inline: "nearest" });
+  });
 }
 
 /** Keys that work wherever the focus is but in fields: key -> what it does. */
