@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pipeline.studies.report import run_report
 from tests import teeth_case as case
-from tests.browser import needs_chromium
-from tests.studies.check_case import SAVE, data_of, doubtful_case, probed
+from tests.browser import needs_chromium, run_in
+from tests.studies.check_case import BEGIN, SAVE, data_of, doubtful_case, probed
 
 FOCUS = """
   const at = () => {
@@ -63,6 +63,52 @@ def test_the_focus_stays_where_one_works(tmp_path: Path) -> None:
     assert result["used"] == ["Undo in ", 3]
     assert result["keys"].startswith("upper row, 4 of 6: 21"), "where what was undone stands"
     assert result["all"] == ["Undo in ", 2]
+
+
+PHONE = """
+  const box = (query) => document.querySelector(query).getBoundingClientRect();
+  const tops = [];
+  const tap = (k, number) => {
+    const before = card(k).getBoundingClientRect().top;
+    const mark = all(".crown", card(k)).find((entry) => entry.textContent.startsWith(number));
+    mark.dispatchEvent(new MouseEvent("click", { bubbles: true }));
+    tops.push(card(k).getBoundingClientRect().top - before);
+  };
+  const settled = () => new Promise((done) => setTimeout(done, 200));
+  result.first = box("#panel").height > 100;
+  card(1).scrollIntoView({ block: "start" });
+  tap(1, "21");
+  tap(1, "11");
+  document.querySelector("#panel .close").click();
+  card(1).scrollIntoView({ block: "end" });
+  tap(1, "41");
+  result.low = box("#panel").top - box(".crown.chosen polygon").bottom;
+  press("1"); press("9");
+  await settled();
+  result.said = document.getElementById("said").textContent;
+  result.dock = box("footer.dock").top - box("#panel").bottom;
+  result.lines = box("#said").width > 300;
+  result.tops = tops.map(Math.round);
+  tell(result);
+})();
+"""
+
+
+@needs_chromium
+def test_on_a_phone_the_chosen_crown_stays_in_sight(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    run_report(workspace)
+    script = BEGIN.removeprefix("<script>") + PHONE
+    folder = tmp_path / "browser"
+    folder.mkdir()
+    page = (workspace / "check.html").read_text()
+    result, log = run_in(page, script, folder, (390, 780), framed=True)
+    assert log == []
+    assert result["first"], "the list of what to look at stands above the photographs until then"
+    assert result["tops"][:2] == [0, 0], "what is touched stays under the finger"
+    assert result["low"] > 0, "the panel covers no crown that is chosen"
+    assert "is no FDI number" in result["said"]
+    assert abs(result["dock"]) <= 1 and result["lines"], "the panel ends where the buttons begin"
 
 
 #: The page is opened five times; what it told before is kept beside what it remembers itself.

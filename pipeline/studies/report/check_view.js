@@ -189,6 +189,7 @@ const drawRest = (panel) => {
       make("li", {}, make("button", { type: "button", class: "plain", onclick: () => {
         choose(photo, id ?? null);
         cardOf(photo).root.scrollIntoView({ block: "nearest" });
+        uncover();
       } }, make("b", {}, photo.name), ` ${text}`))), open.length > most ? make("li", {}, "and more") : null)
       : make("p", { class: "soft" }, "Compare the numbers with the photographs all the same."),
     make("h3", {}, "Keys"),
@@ -250,7 +251,19 @@ const drawChosen = (panel, photo, crown) => {
       "Number the row from here") : null));
 };
 let shown = null; // what was chosen when the page was last drawn
+// In narrow windows the panel lies over the photographs: what is chosen must be seen beside it.
+const uncover = () => {
+  const panel = find("panel");
+  const crown = document.querySelector(".crown.chosen polygon");
+  if (!crown || getComputedStyle(panel).position !== "fixed") return;
+  scrollBy(0, Math.max(0, crown.getBoundingClientRect().bottom + 12 - panel.getBoundingClientRect().top));
+};
+new ResizeObserver(([{ target }]) => {
+  document.body.style.setProperty("--dock", `${target.offsetHeight}px`);
+}).observe(document.querySelector("footer.dock"));
 const draw = () => {
+  const held = (chosen ?? shown) && cardOf((chosen ?? shown).photo).root;
+  const before = held?.isConnected ? held.getBoundingClientRect().top : null;
   const active = document.activeElement;
   const atCrown = active === document.body || active.closest(".chip, #panel");
   const writing = active.matches("#panel input");
@@ -266,7 +279,7 @@ const draw = () => {
   panel.classList.toggle("rest", !crown);
   if (crown) drawChosen(panel, chosen.photo, crown);
   else drawRest(panel);
-const left = photos.filter((photo) => !isUsed(photo));
+  const left = photos.filter((photo) => !isUsed(photo));
   find("aside").hidden = !left.length;
   find("aside").querySelector(".small").replaceChildren(...left.map((photo) => make("figure", {},
     make("img", { src: photo.picture, alt: `Photograph ${photo.name}, left out.` }),
@@ -283,6 +296,8 @@ const left = photos.filter((photo) => !isUsed(photo));
   (wish?.isConnected && !wish.disabled ? wish : find("undo")).focus({ preventScroll: true });
   const again = savedOnce && yamlOf(photos) === saved;
   find("save").textContent = `Save ${data.file}${again ? " again" : ""}`;
+  if (before !== null && held.isConnected) scrollBy(0, held.getBoundingClientRect().top - before);
+  uncover();
 };
 
 // -- saving ----------------------------------------------------------------------------------------
