@@ -111,6 +111,38 @@ def test_on_a_phone_the_chosen_crown_stays_in_sight(tmp_path: Path) -> None:
     assert abs(result["dock"]) <= 1 and result["lines"], "the panel ends where the buttons begin"
 
 
+KEYS = """
+  const free = () => document.querySelector("footer.dock").getBoundingClientRect().top
+    - document.activeElement.getBoundingClientRect().bottom;
+  await wait(200);
+  result.free = all(".chips", document).flatMap((row) => {
+    row.querySelector("button").scrollIntoView({ block: "end" });
+    row.querySelector("button").focus();
+    return free();
+  });
+  all(".chip", card(1))[0].click();
+  scrollTo(0, 0);
+  press("ArrowDown");
+  result.walked = [document.activeElement.getAttribute("aria-label"), free()];
+  tell(result);
+})();
+"""
+
+
+@needs_chromium
+def test_the_focus_is_not_behind_the_buttons(tmp_path: Path) -> None:
+    workspace = doubtful_case(tmp_path / "case")
+    run_report(workspace)
+    folder = tmp_path / "browser"
+    folder.mkdir()
+    page = (workspace / "check.html").read_text()
+    script = BEGIN.removeprefix("<script>") + KEYS
+    result, log = run_in(page, script, folder, (1280, 520), framed=True)
+    assert log == []
+    assert len(result["free"]) == 4 and min(result["free"]) >= 0
+    assert result["walked"][0].startswith("lower row, 1 of 6") and result["walked"][1] >= 0
+
+
 #: The page is opened five times; what it told before is kept beside what it remembers itself.
 REOPENED = """
   Object.assign(result, JSON.parse(localStorage.told ?? '{"opened": []}'));

@@ -259,8 +259,12 @@ const uncover = () => {
   scrollBy(0, Math.max(0, crown.getBoundingClientRect().bottom + 12 - panel.getBoundingClientRect().top));
 };
 new ResizeObserver(([{ target }]) => {
-  document.body.style.setProperty("--dock", `${target.offsetHeight}px`);
+  document.documentElement.style.setProperty("--dock", `${target.offsetHeight}px`);
 }).observe(document.querySelector("footer.dock"));
+let byKeys = false; // who points sees where; for keys the focus has to be in sight
+for (const kind of ["keydown", "pointerdown"]) {
+  addEventListener(kind, ({ type }) => { byKeys = type === "keydown"; }, true);
+}
 const draw = () => {
   const held = (chosen ?? shown) && cardOf((chosen ?? shown).photo).root;
   const before = held?.isConnected ? held.getBoundingClientRect().top : null;
@@ -287,17 +291,17 @@ const draw = () => {
     photo.crowns.length ? make("button", { type: "button", onclick: () => useIt(photo, true) },
       "Use it") : removedRow(photo))));
   find("undo").setAttribute("aria-disabled", String(!past.length));
+  if (before !== null && held.isConnected) scrollBy(0, held.getBoundingClientRect().top - before);
+  uncover();
   // Where the focus was on the crown, it is on its chip; else it stays where it was. What has gone
   // or can't be pressed any more leaves it to what takes that back.
   const near = atCrown && (chosen ?? shown);
   shown = chosen;
   const wish = crown && writing ? panel.querySelector("input")
     : near ? cardOf(near.photo).rows.querySelector(`[data-id="${near.id}"]`) : active;
-  (wish?.isConnected && !wish.disabled ? wish : find("undo")).focus({ preventScroll: true });
+  (wish?.isConnected && !wish.disabled ? wish : find("undo")).focus({ preventScroll: !byKeys });
   const again = savedOnce && yamlOf(photos) === saved;
   find("save").textContent = `Save ${data.file}${again ? " again" : ""}`;
-  if (before !== null && held.isConnected) scrollBy(0, held.getBoundingClientRect().top - before);
-  uncover();
 };
 
 // -- saving ----------------------------------------------------------------------------------------
