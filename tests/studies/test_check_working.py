@@ -124,6 +124,11 @@ KEYS = """
   scrollTo(0, 0);
   press("ArrowDown");
   result.walked = [document.activeElement.getAttribute("aria-label"), free()];
+  const rules = [...document.styleSheets].flatMap((sheet) => [...sheet.cssRules]);
+  rules.filter(({ media }) => media?.mediaText === "print")
+    .forEach(({ media }) => { media.mediaText = "all"; });
+  result.paper = [getComputedStyle(card(0)).breakInside,
+    all("button", card(0)).filter((button) => button.getClientRects().length).length];
   tell(result);
 })();
 """
@@ -140,6 +145,7 @@ def test_the_focus_is_not_behind_the_buttons(tmp_path: Path) -> None:
     result, log = run_in(page, script, folder, (1280, 520), framed=True)
     assert log == []
     assert len(result["free"]) == 4 and min(result["free"]) >= 0
+    assert result["paper"] == ["avoid", 12], "a photograph, its name and its numbers on one sheet"
     assert result["walked"][0].startswith("lower row, 1 of 6") and result["walked"][1] >= 0
 
 
