@@ -61,6 +61,34 @@ def test_the_focus_goes_back_where_it_was(tmp_path: Path) -> None:
     assert found["touched"] == "canvas"
 
 
+TREMBLE = """(async () => {
+  await page.ready;
+  press("m");
+  const { width, height } = canvas.getBoundingClientRect();
+  const tapped = (pointerType, by) => {
+    page.state.pending.length = 0;
+    const at = [width / 2, height * .4];
+    for (const [type, x] of [["pointerdown", at[0]], ["pointermove", at[0] + by],
+      ["pointerup", at[0] + by]]) {
+      canvas.dispatchEvent(new PointerEvent(type,
+        { pointerId: 5, pointerType, clientX: x, clientY: at[1], button: 0, buttons: 1 }));
+    }
+    return page.state.pending.length;
+  };
+  tell({ mouse: [3, 8].map((by) => tapped("mouse", by)),
+    finger: [3, 8, 14].map((by) => tapped("touch", by)),
+    errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_a_finger_may_tremble_more_than_a_mouse(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(), HEAD + TREMBLE, tmp_path, (640, 480), address="#still")
+    assert (found["errors"], log) == ("", [])
+    assert found["mouse"] == [1, 0]
+    assert found["finger"] == [1, 1, 0]
+
+
 SMALL = """(async () => {
   await page.ready;
   const inside = (element) => {

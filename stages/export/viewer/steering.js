@@ -1,7 +1,7 @@
 // Mouse, fingers and keys that move the camera of a `Screen`.
 
-/** A pointer that moves less than this, in pixels, is meant to stay. */
-const TREMBLE = 5;
+/** A pointer that moves less than this, in pixels, is meant to stay; and a finger. */
+const TREMBLE = 5, FINGER_TREMBLE = 10;
 
 /**
  * @param {Screen} screen
@@ -32,7 +32,8 @@ function addPointers(screen, tapped = () => {}, zooms = () => true) {
     const now = [event.clientX, event.clientY];
     const [x, y] = [now[0] - before[0], now[1] - before[1]];
     if (x === 0 && y === 0) return;
-    if (still && Math.hypot(now[0] - still[0], now[1] - still[1]) < TREMBLE) return;
+    const tremble = event.pointerType === "touch" ? FINGER_TREMBLE : TREMBLE;
+    if (still && Math.hypot(now[0] - still[0], now[1] - still[1]) < tremble) return;
     still = null;
     if (pointers.size === 1) {
       if (event.shiftKey || event.buttons & 6) slide(x, y);
