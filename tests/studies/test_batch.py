@@ -267,11 +267,18 @@ def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:
     place = tmp_path / "out" / "cases" / "a"
     record = run()["a"]
     assert (place / "results" / "splats.ply").is_file() and record["bytes"] > 9_000_000
+    kept, gone = (
+        f'<li><a href="results/{name}">{name}</a></li>' for name in ("viewer.html", "splats.ply")
+    )
+    (place / "report.html").write_text(f"<ul>{kept}{gone}</ul>")
     record = run(keep="results")["a"]  # what was made before is trimmed, not made again
     assert computed(tmp_path) == {}
     assert record["kept"] == "results" and record["bytes"] < 12_000_000
     assert set(record["left_out"]) == {"splats.ply", "colmap"}
     assert (place / "results" / "viewer.html").read_text() == "<p>a scene"
+    assert (place / "report.html").read_text() == f"<ul>{kept}</ul>", "no link leads nowhere"
+    said = (place / "results" / "README.txt").read_text()
+    assert said.endswith("Left out by 'pipeline batch --keep results': colmap, splats.ply.\n")
     assert not (place / "fit").exists()
     assert run(keep="results")["a"] == record and computed(tmp_path) == {}
     assert run(keep="results", overrides=["fit.fail=refused"])["a"]["state"] == "refused"

@@ -106,6 +106,7 @@ class ExportStage(Stage):
         found = {"teeth": [11, 12, 13], "measurements": [overjet, hidden]}
         (folder / "teeth.json").write_text(json.dumps(found))
         (folder / "viewer.html").write_text("<p>a scene")
+        (folder / "README.txt").write_text("viewer.html, splats.ply\n")
         Image.new("RGB", (8, 6), "red").save(folder / "preview.png")
         (folder / "splats.ply").write_bytes(bytes(9_000_000))
         (folder / "mesh.ply").write_bytes(bytes(1000))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Collection, Iterator
+import textwrap
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -31,6 +33,8 @@ ORDER = (
 THUMBNAIL = 160
 #: Files of a workspace that only runs need; the stages' folders besides.
 _WORKING = (REQUEST, "pages.json", ".lock", "profile")
+#: A link of the report to a file in `results/`.
+_RESULT_LINK = re.compile(r'<li[^>]*><a href="(results/[^"]+)">[^<]*</a></li>')
 #: What is kept while it is made, when it is whole, and while a new run may replace it.
 _MAKING, _MADE, _BEFORE = ".results.part", ".results", ".results.before"
 
@@ -49,6 +53,7 @@ def keep_results(workspace: Path) -> list[str]:
         remove(making)
         making.mkdir()
         left_out = _copy_within(results, workspace, making)
+        _tell(making / "README.txt", sorted(set(left_out) - {REPORT, CHECK}))
         fsync_tree(making)
         making.rename(made)
     if is_there(made):
@@ -60,6 +65,7 @@ def keep_results(workspace: Path) -> list[str]:
     for page in (REPORT, CHECK):
         if page in left_out:
             remove(workspace / page)
+    _unlink_missing(workspace / REPORT)
     return left_out
 
 
@@ -99,6 +105,30 @@ def _copy_within(results: Path, workspace: Path, into: Path) -> list[str]:
         if entry.parent == results:
             _copy(entry, into / entry.name)
     return left_out
+
+
+def _tell(readme: Path, left_out: Sequence[str]) -> None:
+    """Say at the end of the list of files, if there is one, which of them were left out."""
+    if left_out and readme.is_file():
+        said = f"Left out by 'pipeline batch --keep results': {', '.join(left_out)}."
+        _replace(readme, f"{readme.read_text()}\n{textwrap.fill(said, 100)}\n")
+
+
+def _unlink_missing(report: Path) -> None:
+    """Take the links to results that were left out off the report."""
+    if report.is_file():
+        before = report.read_text()
+        after = _RESULT_LINK.sub(
+            lambda link: link[0] if is_there(report.parent / link[1]) else "", before
+        )
+        if after != before:
+            _replace(report, after)
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = temporary_beside(path)
+    temporary.write_text(text)
+    temporary.replace(path)
 
 
 def _rank(path: Path) -> tuple[int, str]:
