@@ -70,9 +70,15 @@ def findings(case: Case) -> Iterator[Fact]:
             "empty."
         )
     if metrics.figures and not metrics.held_out:
+        kept_back = case.latest("held_out")
+        why = (
+            "the true cameras of the photographs held out are not known (evaluate.ground_truth)"
+            if kept_back and kept_back.views
+            else "no photograph was held out (views.held_out, with evaluate.ground_truth)"
+        )
         yield Fact(
-            "How right the scene is from other directions was not measured: no photograph was held "
-            "out (views.held_out). Directions far from all photographs are guesses."
+            f"How right the scene is from other directions was not measured: {why}. Directions far "
+            "from all photographs are guesses."
         )
 
 

@@ -36,7 +36,7 @@ def photographs(case: Case) -> Iterator[Section]:
         state = "placed" if view.name in placed else "not placed" if cameras else "read"
         tiles.append(_thumbnail(view, state, why))
     for view in held_out.views if held_out else ():
-        tiles.append(_thumbnail(view, "held out", "scored, but kept from every other stage"))
+        tiles.append(_thumbnail(view, "held out", "kept from every stage but evaluate"))
     total = len(views.views)
     note = f"{total} read"
     if cameras:

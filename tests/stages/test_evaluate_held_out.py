@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,13 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.metrics import Metrics
 from pipeline.artifacts.views import HeldOut, View, Views, to_uint8, write_png
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
 from pipeline.untrusted.scenes.transforms import OPENCV_FROM_OPENGL
 from stages.evaluate.config import EvaluateConfig
+from stages.evaluate.report import PARTS
 from stages.evaluate.stage import EvaluateStage
 from stages.evaluate.truth import scoring_mask
 from stages.splatting.rendering import render
@@ -218,3 +221,13 @@ def test_the_place_of_the_truth_is_not_part_of_the_key() -> None:
     for name in ("ground_truth", "mesh", "masks", "lpips_weights"):
         extra = EvaluateConfig.model_fields[name].json_schema_extra
         assert extra == {"affects_result": False}, name
+
+
+@pytest.mark.parametrize(
+    ("kept_back", "said"), [(True, "true cameras of the photographs held out"), (False, "no photo")]
+)
+def test_the_page_says_why_no_other_direction_was_measured(kept_back: bool, said: str) -> None:
+    view = View("h000", np.zeros((4, 4, 3), np.float32))
+    found = {"metrics": Metrics({"mean": {}}), "held_out": HeldOut((view,)) if kept_back else None}
+    (fact,) = PARTS["findings"](SimpleNamespace(latest=found.get, labels={}))
+    assert said in fact.text and "not measured" in fact.text
