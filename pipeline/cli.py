@@ -91,7 +91,8 @@ def run_command(
     stages: Stages = None,
     overrides: Overrides = None,
     frames: Annotated[
-        int | None, typer.Option("--frames", help="Use this many, evenly sampled.")
+        int | None,
+        typer.Option("--frames", help="Use so many, evenly chosen; default: all, 24 of a video."),
     ] = None,
     from_stage: Annotated[
         str | None,

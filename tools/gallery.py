@@ -55,7 +55,7 @@ class Shot:
 
 
 SHOTS = (
-    Shot("viewer", "", "The viewer, at the first photograph's place."),
+    Shot("viewer", "", "The viewer, as it opens."),
     Shot("numbers", "numbers=fdi", "The teeth with their FDI numbers."),
     Shot(
         "support", "support=1",

@@ -37,7 +37,7 @@ def preview(case: Case) -> Iterator[Hero]:
     for name in case.providers("exports")[::-1]:
         folder = case.folder(name, "exports")
         if folder and (folder / "preview.png").is_file():
-            said = "The scene, rendered from several directions."
+            said = "A photograph, the scene from its place, and from another."
             yield Hero(from_file(folder / "preview.png", said, "", 1100), said)
             return
 
