@@ -89,7 +89,7 @@ reader-tissue: .venv/installed-dev
 system:
 	@tools/system-packages required
 
-# Only the test of the viewer page needs a browser.
+# Only the tests of the pages need a browser.
 chromium:
 	@tools/system-packages browser
 

@@ -3,9 +3,9 @@
     import dentalsplat
     summary = dentalsplat.run("photos/", overrides={"fit.iterations": 500})
 
-What the command line does, these functions do too, under the same names. They are imported when
-they are asked for, so that ``import dentalsplat`` is quick, from the packages behind them:
-`pipeline` (the engine) and `stages` (the algorithms).
+What the command line does, these functions do too, under the same names (but for `register`,
+`dicom` and `warmup`). They are imported when they are asked for, so that ``import dentalsplat`` is
+quick, from the packages behind them: `pipeline` (the engine) and `stages` (the algorithms).
 """
 
 from __future__ import annotations
