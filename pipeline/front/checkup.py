@@ -38,6 +38,8 @@ OPTIONAL = {
     "torch": ("torch", "LPIPS, pointmap models and the GPU"),
     "torchmetrics": ("torchmetrics", "LPIPS"),
     "distributed": ("distributed", "many cases with one command (pipeline batch)"),
+    "pydicom": ("pydicom", "DICOM files"),
+    "pyinstrument": ("pyinstrument", "pipeline run --profile"),
 }
 
 #: soname -> Debian package that brings it.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import configparser
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -19,6 +22,16 @@ def test_missing_library_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["numpy"].level == "ok"
     assert found["no-such-thing"].level == "problem"
     assert "pip install" in found["no-such-thing"].mend
+
+
+def test_every_extra_of_a_user_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = configparser.ConfigParser(interpolation=None)
+    config.read(Path(checkup.__file__).resolve().parents[2] / "setup.cfg")
+    monkeypatch.setattr(checkup, "LIBRARIES", {})
+    told = set(by_name(list(checkup._libraries())))
+    for extra in ("torch", "batch", "dicom", "profile"):
+        brought = config["options.extras_require"][extra]
+        assert told & set(re.findall(r"^[\w-]+", brought, re.MULTILINE)), extra
 
 
 def test_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
