@@ -15,7 +15,7 @@ class TeethConfig(StageConfig):
     method: Literal["auto", "reader", "none"] = Field(
         "auto",
         description="reader: read every photograph; none: none; auto: read at most `most_views`, "
-        "and leave scenes alone of which a few show no teeth",
+        "and nothing where hardly any of these shows teeth",
     )
     most_views: int = Field(
         12,

@@ -54,7 +54,7 @@ _OUTLINE_TOLERANCE = 0.2
 
 @dataclass(frozen=True)
 class Found:
-    """A crown in the network's frame, before anything is made of it.
+    """A crown in a photograph, before anything is made of it.
 
     Attributes:
         polygon: [K, 2] pixels of the photograph.

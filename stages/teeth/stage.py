@@ -22,7 +22,7 @@ class TeethStage(Stage):
     prepares = True
     libraries = ("opencv-contrib-python-headless", "numpy", "scipy")
     methods = {  # noqa: RUF012
-        "auto": "the reader, where the photographs are few and show teeth",
+        "auto": "the reader, on a dozen photographs (teeth.most_views), where some show teeth",
         "reader": "a small network trained by us, then the order of the teeth in their rows",
         "none": "read nothing",
     }

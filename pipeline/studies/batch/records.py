@@ -26,7 +26,7 @@ STATES = {
 FINAL = ("done", "refused", "wrong", "fault", "killed")
 #: Those that `--retry failed` means.
 FAILED = ("refused", "wrong", "fault", "killed")
-#: Those that have a workspace or may get one; the others are settled before anything runs.
+#: What is settled of a case before anything runs; empty: it is to be run.
 Settled = Literal["", "wrong", "duplicate", "skipped"]
 
 FOLDERS = ("cases", "records", "thumbnails", "logs")

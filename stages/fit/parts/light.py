@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.splatting.rasterizer import Viewpoint
 
 
-#: bounds of the scene's light, in the order of `LensLight.values`: what no tissue and no flash
+#: bounds of the scene's light, in the order of `Light.values`: what no tissue and no flash
 #: exceeds. They keep a wrong start from running away.
 LOWEST = np.array([0.0, 0.0, 20.0, 1e-3, 2.0, 1e-4])
 HIGHEST = np.array([0.98, 4.0, 2000.0, 5.0, 40.0, 1.0])

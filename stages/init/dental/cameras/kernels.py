@@ -19,7 +19,7 @@ OWN_DISTANCE = 0.1
 #: Residuals beyond these many standard deviations count less (landmarks: pseudo-Huber, dense
 #: matches: Cauchy).
 LANDMARK_KNEE, DENSE_KNEE = 2.0, 1.5
-#: The point of the arch that cameras look at (mm): x, y, z.
+#: How far to the front the point of the arch lies that cameras look at (mm).
 CENTRE_Z = -16.0
 
 

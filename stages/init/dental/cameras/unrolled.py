@@ -59,7 +59,7 @@ class Photo:
     """What unrolling needs of a photograph.
 
     Attributes:
-        grey: [H, W] float32, `tooth_grey` of it.
+        grey: [H, W] float32, by `LIGHTNESS` and `REDNESS`.
         usable: [H, W] float32, 1 where near teeth and valid, else 0.
         roll: radians by which the row of teeth is turned clockwise.
         band: height of the band of teeth, pixels.
