@@ -108,15 +108,24 @@ def newest(folder: Path, pattern: str) -> Path:
 
 
 def scored(
-    workspace: Path, request: Mapping[str, Any], ply: Path | None, background: Sequence[float]
+    workspace: Path,
+    request: Mapping[str, Any],
+    ply: Path | None = None,
+    background: Sequence[float] | None = None,
 ) -> RunSummary:
-    """Score our scene, or that of a file, with the settings of the workspace."""
+    """Score our scene, or that of a file, with the settings of the workspace.
+
+    Args:
+        background: behind the file's scene; None: as the file says.
+    """
     import dentalsplat
 
     stages, overrides = ["evaluate"], list(request["overrides"])
     if ply is not None:
         stages = ["splats", "evaluate"]
-        overrides += [f"splats.file={json.dumps(str(ply))}", f"splats.background={[*background]}"]
+        overrides.append(f"splats.file={json.dumps(str(ply))}")
+        if background is not None:
+            overrides.append(f"splats.background={[*background]}")
     return dentalsplat.run(
         workspace=workspace, preset=request["preset"], overrides=overrides, stages=stages
     )
@@ -144,7 +153,7 @@ def row(name: str, summary: RunSummary, cost: Cost, iterations: int | None) -> s
 
 def compared(
     workspace: Path, name: str, ply: Path, cost: Cost, iterations: int | None,
-    background: Sequence[float],
+    background: Sequence[float] | None,
 ) -> list[str]:  # fmt: skip
     """The rows of our scene and of the peer's; the workspace is left as it was found."""
     import dentalsplat
@@ -158,7 +167,7 @@ def compared(
         if fit is not None:
             did = fit.manifest
             ours = Cost(did["cpu_seconds"], did["wall_seconds"], did["peak_memory_mb"])
-            summary = scored(workspace, request, None, background)
+            summary = scored(workspace, request)
             rows.append(row("ours (fit)", summary, ours, did["summary"].get("iterations")))
         rows.append(row(name, scored(workspace, request, ply, background), cost, iterations))
     finally:  # all of it is cached
@@ -176,7 +185,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, help="that the command is told to run")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--ply", help="pattern of the .ply, where the program names it itself")
-    parser.add_argument("--background", type=float, nargs=3, default=(0.0, 0.0, 0.0))
+    parser.add_argument("--background", type=float, nargs=3, help="default: what the .ply says")
     parser.add_argument("--out", type=Path, help="default: runs/peers/NAME")
     parser.add_argument("command", nargs="*", help="after --")
     options = parser.parse_args()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.peers import scored
 from pipeline.running.outcomes import RunSummary
 from pipeline.workspace import read_request
 
@@ -63,6 +64,18 @@ def test_a_peer_that_gives_our_scene_has_our_figures(workspace: Path, tmp_path: 
     scored = workspace / "evaluate" / evaluated["key"][:12] / "metrics" / "metrics.json"
     figure = json.loads(scored.read_text())["mean"]["psnr"]
     assert ours[6].startswith(f"{figure:.2f} / ")
+
+
+def test_a_colour_behind_the_scene_is_the_files_own_unless_one_is_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[list[str]] = []
+    monkeypatch.setattr("dentalsplat.run", lambda **given: asked.append(given["overrides"]))
+    request = {"preset": None, "overrides": ["fit.light=none"]}
+    scored(Path("w"), request, Path("peer.ply"))
+    scored(Path("w"), request, Path("peer.ply"), [0.0, 0.5, 1.0])
+    assert asked[0] == ["fit.light=none", 'splats.file="peer.ply"']
+    assert asked[1] == [*asked[0], "splats.background=[0.0, 0.5, 1.0]"]
 
 
 def test_what_can_not_be_measured_is_said(tmp_path: Path) -> None:
