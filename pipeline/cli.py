@@ -313,8 +313,9 @@ def clean_command(
     if as_json:
         print(json.dumps({"removed": removed, "bytes": freed, "checkpoints": kept}, indent=1))
     else:
+        deletes = "another process is working there" if everything else "--all deletes it"
         for name, size in kept.items():
-            print(f"kept {name}, {size / 2**20:.1f} MB: a run goes on from it (--all deletes it)")
+            print(f"kept {name}, {size / 2**20:.1f} MB: a run goes on from it ({deletes})")
         for name in removed:
             print(f"deleted {name}")
         print(f"{len(removed)} results deleted, {freed / 2**20:.1f} MB freed")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from toy import artifact_bytes
 
 import pipeline
@@ -339,6 +340,10 @@ def test_clean_keeps_what_a_run_goes_on_from(
     assert f"kept count/{kept.key[:12]}.partial, 0.0 MB" in told and "1 results deleted" in told
     assert run(QUIET, "count.fail=interrupt")["count"] == "resumed"
     stopped(run, "count.steps=20")
+    with FileLock(toys / "w" / "count" / ".lock"):
+        capsys.readouterr()
+        app(["clean", "-w", str(toys / "w"), "--all"], standalone_mode=False)
+        assert "(another process is working there)" in capsys.readouterr().out
     pipeline.clean(toys / "w", everything=True)
     assert not pipeline.status(workspace=toys / "w")[2].resumable
     no_leftovers(toys / "w")
