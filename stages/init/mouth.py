@@ -25,7 +25,7 @@ from pipeline.artifacts.dental.fdi import (
     primary_of,
     teeth_of,
 )
-from pipeline.artifacts.dental.sizes import textbook_width
+from pipeline.artifacts.dental.sizes import TEXTBOOK_DEVIATION, textbook_width
 from pipeline.artifacts.teeth import Teeth
 from pipeline.artifacts.views import View
 from stages.init.scale import depth_near
@@ -46,13 +46,6 @@ LEAST_TEETH, LEAST_PAIRS = 5, 2
 LEAST_DEPTH, LEAST_FLATNESS = 0.15, 0.5
 #: So many neighbours side by side tell a scale.
 LEAST_NEIGHBOURS = 5
-#: Relative standard deviation of a scale from textbook teeth, however many are seen. People's rows
-#: are longer or shorter than a textbook's by 5 %, crowded or spaced; and edges that are seen in
-#: front of the line of contacts are further apart in the curve of the arch. On eight films of
-#: generated mouths, four of them children's, and one of crowns scanned from a patient it is off by
-#: 7 % (root mean square; 13 % in a child with small teeth). Where teeth place the cameras: by 5 %
-#: on 44 generated mouths, by 9 % on the one real patient of whom a scan says it.
-TEXTBOOK_DEVIATION = 0.1
 #: Rounds in which teeth that stand out of the plane lose weight.
 ROUNDS = 8
 

@@ -132,7 +132,7 @@ def toy_motions() -> dict[int, np.ndarray]:
     return {number: motion(centres[number], *how) for number, how in MOVED.items()}
 
 
-def write_visit(workspace: Path, visit: Visit) -> Path:
+def write_visit(workspace: Path, visit: Visit, scale: Scale | None = None) -> Path:
     """The visit as the workspace of a finished run."""
     workspace.mkdir(parents=True)
     stages = ["views", "teeth", "init", "fit"]
@@ -175,7 +175,9 @@ def write_visit(workspace: Path, visit: Visit) -> Path:
         np.full(count, 4.0, np.float32),
         sh,
     )
-    cameras = Cameras(tuple(look.camera for look in visit.looks), scale=Scale("mm", "cameras"))
+    cameras = Cameras(
+        tuple(look.camera for look in visit.looks), scale=scale or Scale("mm", "cameras")
+    )
     files = [(view.name, sha256(view.image).hexdigest()) for view in views]
     write_result(workspace, "views", [Views(tuple(views))], sources=files)
     write_result(workspace, "teeth", [Teeth(tuple(dentitions))])

@@ -13,10 +13,11 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
+from pipeline.artifacts.space.scale import Scale
 from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.studies.register import comparing, run_register, solving
-from pipeline.studies.register.visit import Visit, names_of
+from pipeline.studies.register.visit import Visit, names_of, read_visit
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
 
@@ -153,6 +154,12 @@ def test_visits_whose_folders_are_called_alike_are_told_apart(tmp_path: Path) ->
     assert names_of([may, june]) == ["may/anna", "june/anna"]
     assert names_of([may, june.parent]) == ["anna", "june"]
     assert names_of([may, may]) == ["anna", "anna"]
+
+
+def test_a_run_without_a_scale_is_as_large_as_textbook_teeth(tmp_path: Path) -> None:
+    write_visit(tmp_path / "w", toy_visit("first"), Scale())
+    visit = read_visit(tmp_path / "w")
+    assert (visit.scale_percent, visit.scale_source) == (10.0, "textbook teeth")
 
 
 def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:

@@ -29,6 +29,13 @@ PRIMARY_HEIGHTS: dict[Jaw, tuple[float, ...]] = {
     "upper": (6.0, 5.6, 6.5, 5.1, 5.7),
     "lower": (5.0, 5.2, 6.0, 6.0, 5.5),
 }
+#: Relative standard deviation of a scale from textbook teeth, however many are seen. People's rows
+#: are longer or shorter than a textbook's by 5 %, crowded or spaced; and edges that are seen in
+#: front of the line of contacts are further apart in the curve of the arch. On eight films of
+#: generated mouths, four of them children's, and one of crowns scanned from a patient it is off by
+#: 7 % (root mean square; 13 % in a child with small teeth). Where teeth place the cameras: by 5 %
+#: on 44 generated mouths, by 9 % on the one real patient of whom a scan says it.
+TEXTBOOK_DEVIATION = 0.1
 
 
 def textbook_width(tooth: int) -> float:

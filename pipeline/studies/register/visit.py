@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.sizes import millimetres_per_unit
+from pipeline.artifacts.dental.sizes import TEXTBOOK_DEVIATION, millimetres_per_unit
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
@@ -249,8 +249,6 @@ SOURCES = {
     "textbook_teeth": "textbook teeth",
     "none": "the run, which does not say from where",
 }
-#: Relative standard deviation of a size that textbook teeth say.
-TEXTBOOK_DEVIATION = 0.08
 
 
 def textbook_scale(centres: Mapping[int, Array]) -> float:

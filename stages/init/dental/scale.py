@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeline.artifacts.dental.fdi import permanent_of, teeth_of
+from pipeline.artifacts.dental.sizes import TEXTBOOK_DEVIATION
 from pipeline.errors import RequestError
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit
-from stages.init.mouth import TEXTBOOK_DEVIATION
 
 #: Relative standard deviation of a crown's width as it comes out between its landmarks.
 WIDTH_DEVIATION = 0.04
