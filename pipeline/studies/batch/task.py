@@ -48,9 +48,9 @@ def look(out: str, batch: str) -> str:
         found = None
     if not isinstance(found, dict) or found.get("id") != batch:
         return (
-            f"The worker on {socket.gethostname()} does not see the folder {out} of this batch. "
-            "Workers on other machines need a shared file system, on which photographs and results "
-            "have the same paths everywhere."
+            f"The worker on {socket.gethostname()} does not see the folder {out} of this batch, or "
+            "may not read it. Workers on other machines need a shared file system, on which "
+            "photographs and results have the same paths everywhere, and run as the same user."
         )
     version = library_version("dentalsplat")
     if found.get("version") != version:
