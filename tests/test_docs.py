@@ -17,6 +17,13 @@ from pipeline.stage import stage_names
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+#: Pages that the site does not hold.
+BESIDE = [
+    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY", "CHANGELOG")),
+    ROOT / "benchmarks" / "peers.md", ROOT / "data_samples" / "README.md",
+]  # fmt: skip
+#: Suffixes of files that are called as stages are.
+FILES = {".ply", ".sog", ".spz", ".json", ".csv", ".yaml"}
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -73,12 +80,39 @@ def test_examples_of_extending_run(tmp_path: Path) -> None:
     assert names["Heights"].load(tmp_path).by_tooth == {"11": 9.5}
 
 
+@pytest.mark.parametrize("page", sorted({*PAGES, *BESIDE}), ids=lambda page: page.name)
+def test_named_files_exist_and_scripts_have_the_options(page: Path) -> None:
+    folders = "benchmarks|configs|data_samples|docs|pipeline|stages|tests|tools"
+    named = rf"`(?:python )?((?:{folders})/[\w/.-]+\.\w+)([^`]*)`"
+    for name, rest in re.findall(named, page.read_text()):
+        assert (ROOT / name).exists(), f"{page.name}: {name}"
+        for option in re.findall(r"--[a-z-]+", rest):
+            assert f'"{option}"' in (ROOT / name).read_text(), f"{page.name}: {name} {option}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_named_files_exist(page: Path) -> None:
-    for name in re.findall(
-        r"`((?:stages|pipeline|configs|tools|docs|data_samples)/[\w/.-]+\.\w+)`", page.read_text()
-    ):
-        assert (ROOT / name).exists() or "fit/parts" in name, f"{page.name}: {name}"
+def test_settings_in_sentences_exist(page: Path) -> None:
+    known = {setting.name for setting in settings()}
+    known |= {name.rpartition(".")[0] for name in known}  # sections, too
+    stages = "|".join(stage_names())
+    for name in re.findall(rf"`(?:--set )?'?((?:{stages})\.[\w.]+)[^`]*`", page.read_text()):
+        assert name in known or Path(name).suffix in FILES, f"{page.name}: {name}"
+
+
+@pytest.mark.parametrize("page", BESIDE, ids=lambda page: page.name)
+def test_links_that_the_site_does_not_check_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if not link.startswith("http"):
+            name, _, anchor = link.partition("#")
+            target = page.parent / name if name else page
+            assert target.exists(), f"{page.name}: {link}"
+            assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Those that GitHub gives the headings of a page."""
+    found = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in found}
 
 
 def test_pages_made_from_the_code_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
