@@ -207,7 +207,7 @@ def settings_command(
     stage: Annotated[
         str | None,
         typer.Argument(
-            metavar="[STAGE]", autocompletion=completion.stage, help="Only those of this stage."
+            metavar="STAGE", autocompletion=completion.stage, help="Only those of this stage."
         ),
     ] = None,
     as_json: AsJson = False,
