@@ -22,7 +22,14 @@ from pipeline.studies.register.matching import (
     spots_between,
 )
 from pipeline.studies.register.movement import tooth_axes
-from pipeline.studies.register.photometric import FITS, judged, searched
+from pipeline.studies.register.photometric import (
+    FITS,
+    Marks,
+    facings,
+    judged,
+    mark_spots,
+    searched,
+)
 from pipeline.studies.register.solving import Block, Pull, State
 from pipeline.studies.register.visit import Visit, in_frame
 
@@ -46,6 +53,9 @@ EXPECTED, CLEAR = 0.5, 0.3
 PRIOR = np.diag([1.0] * 3 + [1 / np.radians(6.0) ** 2] * 3)
 #: A tooth is measured if it has so many spots in all.
 LEAST_SPOTS = 120
+#: Rounds of laying marks onto each other, by their blur (see `photometric.MARK_BLURS`), steps of
+#: each, and points of a crown in a pair of photographs and pairs at most.
+MARK_ROUNDS, MARK_STEPS, MARK_POINTS, MARK_PAIRS = (0, 1, 1, 1), 3, 1000, 24
 
 
 @dataclass(frozen=True)
@@ -144,7 +154,8 @@ def finished(found: Started) -> Estimate:
         for _ in range(STEPS):
             state = _step(spots, state, centres, still, laid)
         factor /= noise(spots, state, centres, still)
-    blocks = [solving.block_of(s, state, centres[s.tooth]) for s in spots]
+    state, marks = by_marks(found, state, still, spots)
+    blocks = solving.blocks_of(marks, state, centres)
     seen, fits = judged(a, b, state, still, centres, compared_pairs(a, state))
     likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
@@ -152,6 +163,35 @@ def finished(found: Started) -> Estimate:
         state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
         found.first_from_second, seen, fits,
     )  # fmt: skip
+
+
+def by_marks(
+    found: Started, state: State, still: Sequence[int], spots: Sequence[Spots]
+) -> tuple[State, list[Spots]]:
+    """Lay the marks of the crowns onto each other, and what they say at the end.
+
+    Optical flow needs a window that takes shading in, which stays with the light when a tooth
+    turns. Once it has found the place to a pixel, the finest contrast alone tells the rest. Crowns
+    whose marks do not agree keep what flow says.
+
+    Args:
+        found: the photographs, and what else is known of the teeth.
+        state, still, spots: what flow says.
+    """
+    a, b = Marks(found.first), Marks(found.second)
+    pairs = compared_pairs(found.first, state)
+    teeth = sorted({s.tooth for s in spots if len(s.points)})
+    factor, made = 1.0, list(spots)
+    for level in MARK_ROUNDS:
+        views = [v for n in teeth for v in facings(n, a, b, state, pairs, MARK_POINTS, MARK_PAIRS)]
+        for _ in range(MARK_STEPS):
+            made = [
+                replace(s, information=s.information * factor)
+                for s in mark_spots(views, level, state)
+            ]
+            state = _step(made, state, found.centres, still, found.laid)
+        factor /= noise(made, state, found.centres, still)
+    return state, made
 
 
 def calibrated(laid: dict[int, Laid], agreeing: Sequence[int]) -> dict[int, Laid]:
@@ -233,7 +273,7 @@ def _step(
 ) -> State:  # fmt: skip
     """One Gauss-Newton step of everything. `still`: None while it is open who stood still."""
     used = [s for s in spots if len(s.points)]
-    blocks = [solving.block_of(s, state, centres[s.tooth]) for s in used]
+    blocks = solving.blocks_of(used, state, centres)
     teeth = sorted({s.tooth for s in used})
     drift = {n: solving.displacement(state.motions[n], centres[n]) for n in teeth}
     system = solving.system_of(blocks, len(state.cameras))
@@ -259,7 +299,7 @@ def noise(
     """
     sizes = []
     for n in still:
-        mine = [solving.block_of(s, state, centres[n]) for s in spots if s.tooth == n]
+        mine = solving.blocks_of((s for s in spots if s.tooth == n), state, centres)
         matrix = sum((b.matrix[:6, :6] for b in mine), 1e-9 * np.eye(6))
         change = np.linalg.solve(matrix, sum((b.vector[:6] for b in mine), np.zeros(6)))
         sizes.append(float(change @ matrix @ change) / 6)

@@ -17,6 +17,9 @@ Array = npt.NDArray[np.float64]
 
 #: Window of the local contrast, pixels of a picture 512 wide.
 CONTRAST = 4.0
+#: Window of the contrast that is left of the marks of enamel alone, pixels of any picture: shading
+#: is smooth, marks are as sharp as the picture.
+MARKS = 1.5
 #: Highlights: brighter than what is beside them by this (0..1), and half as wide (pixels) at most.
 SHINE, SHINE_SIZE = 0.08, 6
 #: Pixels around a crown that move with it when pictures are laid over each other.
@@ -92,6 +95,7 @@ class Prepared:
     Attributes:
         look: the photograph.
         contrast: [H, W] uint8, locally normalised.
+        marks: [H, W] uint8, the same over as few pixels as may be.
         owner: [H, W] uint8 the tooth whose motion a pixel shares, 0: none's.
         core: [H, W] uint8 the tooth well inside whose crown a pixel lies.
         tensor: [H, W, 2, 2] structure tensor of `contrast`.
@@ -99,6 +103,7 @@ class Prepared:
 
     look: Look
     contrast: npt.NDArray[np.uint8]
+    marks: npt.NDArray[np.uint8]
     owner: Labels
     core: Labels
     tensor: Floats
@@ -111,7 +116,7 @@ def prepare(look: Look) -> Prepared:
     scale = max(look.image.shape) / 512
     dull, shiny = without_shine(look.without_hardware, scale)
     gray = np.clip(np.rint(dull * 255), 0, 255).astype(np.uint8)
-    contrast = local_contrast(gray, CONTRAST * scale)
+    contrast, marks = local_contrast(gray, CONTRAST * scale), local_contrast(gray, MARKS)
     labels = look.enamel
     distance, nearest = cv2.distanceTransformWithLabels(
         (labels == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
@@ -124,7 +129,7 @@ def prepare(look: Look) -> Prepared:
         inside = cv2.distanceTransform((labels == number).astype(np.uint8), cv2.DIST_L2, 5)
         core[inside > INSET * scale] = number
     core[(look.depth <= 0) | ~look.valid | shiny] = 0
-    return Prepared(look, contrast, owner, core, structure(contrast))
+    return Prepared(look, contrast, marks, owner, core, structure(contrast))
 
 
 def without_shine(image: Floats, scale: float) -> tuple[Floats, npt.NDArray[np.bool_]]:

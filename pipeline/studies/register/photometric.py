@@ -9,7 +9,7 @@ chooses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.studies.register import solving
-from pipeline.studies.register.matching import Prepared, Spots
+from pipeline.studies.register.matching import GREY, Prepared, Spots
 from pipeline.studies.register.solving import State
 from pipeline.studies.register.visit import Floats
 
@@ -34,6 +34,8 @@ FITS, CLEARLY = 0.6, 0.05
 #: Blur of the pictures, pixels of one 512 wide, and steps with each.
 COARSE_TO_FINE = ((2.0, 6), (1.0, 5))
 FINE = len(COARSE_TO_FINE) - 1
+#: Blur of the finest contrast, pixels of any picture.
+MARK_BLURS = (1.0, 0.4)
 #: Points of a crown in each pair, and how few are too few.
 POINTS, LEAST, PAIRS = 250, 40, 12
 #: So many points side by side say the same: contrast reaches over several pixels.
@@ -50,6 +52,8 @@ class Facing:
     """A crown in a pair of photographs.
 
     Attributes:
+        tooth: FDI number.
+        first, second: indices of the photographs, of the first and the second visit.
         points: [N, 3] of the first visit's crown, mm.
         values: per blur, [N] contrast in the first photograph, mean 0 and deviation 1.
         pictures: per blur, [H, W, 3] contrast of the second photograph and its derivatives.
@@ -58,6 +62,9 @@ class Facing:
         camera: of the second photograph.
     """
 
+    tooth: int
+    first: int
+    second: int
     points: Array
     values: tuple[Array, ...]
     pictures: tuple[Floats, ...]
@@ -76,27 +83,41 @@ class Fit:
 
 
 class Pictures:
-    """Blurred contrast of a visit's photographs, made once."""
+    """Blurred contrast of a visit's photographs and its derivatives, made once."""
 
     def __init__(self, prepared: Sequence[Prepared]) -> None:
         self.prepared = prepared
-        self.made = []
-        for p in prepared:
-            scale = max(p.contrast.shape) / 512
-            image = p.contrast.astype(np.float32) - 128
-            levels = []
-            for sigma, _ in COARSE_TO_FINE:
-                soft = cv2.GaussianBlur(image, (0, 0), sigma * scale)
-                dx = cv2.Scharr(soft, cv2.CV_32F, 1, 0) / 32
-                dy = cv2.Scharr(soft, cv2.CV_32F, 0, 1) / 32
-                levels.append(np.dstack([soft, dx, dy]))
-            self.made.append(tuple(levels))
+        self.made = [tuple(_with_slopes(level) for level in self.levels(p)) for p in prepared]
+
+    def levels(self, prepared: Prepared) -> list[Floats]:
+        """A photograph's contrast at each level, [H, W], from the most blurred one on."""
+        scale = max(prepared.contrast.shape) / 512
+        return [blurred(prepared.contrast, sigma * scale) for sigma, _ in COARSE_TO_FINE]
+
+
+class Marks(Pictures):
+    """The finest contrast of a visit's photographs, and its derivatives."""
+
+    def levels(self, prepared: Prepared) -> list[Floats]:
+        """Blurred a little, and hardly."""
+        return [blurred(prepared.marks, sigma) for sigma in MARK_BLURS]
+
+
+def blurred(contrast: npt.NDArray[np.uint8], sigma: float) -> Floats:
+    """[H, W] contrast about 0, blurred by so many pixels."""
+    return np.asarray(cv2.GaussianBlur(contrast.astype(np.float32) - GREY, (0, 0), sigma))
+
+
+def _with_slopes(picture: Floats) -> Floats:
+    slopes = (cv2.Scharr(picture, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1)))
+    return np.dstack([picture, *slopes])
 
 
 def facings(
-    tooth: int, a: Pictures, b: Pictures, state: State, pairs: Sequence[tuple[int, int]]
-) -> list[Facing]:
-    """The crown in all pairs of photographs that show it."""
+    tooth: int, a: Pictures, b: Pictures, state: State, pairs: Sequence[tuple[int, int]],
+    most_points: int = POINTS, most: int = PAIRS,
+) -> list[Facing]:  # fmt: skip
+    """The crown in the pairs of photographs that show it, where it is largest first."""
     found, sizes = [], []
     motion = state.motions[tooth]
     for i, j in pairs:
@@ -118,17 +139,17 @@ def facings(
         kept = np.flatnonzero(inside)[near[row[inside], column[inside]]]
         if len(kept) < max(LEAST, 0.3 * len(points)):
             continue
-        kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), POINTS)).astype(int)]
+        kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), most_points)).astype(int)]
         clear = ((other.core > 0) & (theirs > 0)).astype(np.float32)
         values = tuple(level[..., 0][crown][kept].astype(np.float64) for level in a.made[i])
-        found.append(Facing(points[kept], values, b.made[j], theirs, clear, camera))
+        found.append(Facing(tooth, i, j, points[kept], values, b.made[j], theirs, clear, camera))
         sizes.append(int(crown.sum()))
-    return [found[k] for k in np.argsort(sizes, kind="stable")[::-1][:PAIRS]]
+    return [found[k] for k in np.argsort(sizes, kind="stable")[::-1][:most]]
 
 
 def photographs(views: Sequence[Facing]) -> int:
     """How many photographs of the second visit these are."""
-    return len({facing.camera.name for facing in views})
+    return len({facing.second for facing in views})
 
 
 def _sampled(facing: Facing, level: int, motion: Array) -> tuple[Array, Array, Array, Array]:
@@ -139,6 +160,39 @@ def _sampled(facing: Facing, level: int, motion: Array) -> tuple[Array, Array, A
     crown = cv2.remap(facing.crown, x, y, cv2.INTER_LINEAR)[0]
     clear = cv2.remap(facing.clear, x, y, cv2.INTER_LINEAR)[0] > 0.5
     return pixels, value.astype(np.float64), crown, clear
+
+
+def contrast_spots(facing: Facing, level: int, motion: Array) -> Spots | None:
+    """Where a crown's points would look as they do in the first photograph (Lucas and Kanade).
+
+    Each is as sure as the picture is steep there; along an edge nothing is said.
+    None where too few are seen.
+    """
+    pixels, value, _, clear = _sampled(facing, level, motion)
+    if clear.sum() < LEAST / 2:
+        return None
+    x, y = facing.values[level][clear], value[clear, 0]
+    x = (x - x.mean()) / max(float(x.std()), 1.0)
+    size = max(float(y.std()), 1.0)
+    off = x - (y - y.mean()) / size
+    slope = value[clear, 1:] / size
+    steep = (slope**2).sum(1)
+    unlike = float(np.mean(off**2))
+    return Spots(
+        facing.tooth, facing.first, facing.second, facing.points[clear],
+        pixels[clear] + slope * (off / np.maximum(steep, 1e-6))[:, None],
+        slope[:, :, None] * slope[:, None, :] / (max(unlike, 0.05) * ALIKE),
+        1 - unlike / 2, int(clear.sum()),
+    )  # fmt: skip
+
+
+def mark_spots(views: Sequence[Facing], level: int, state: State) -> list[Spots]:
+    """What the marks of crowns say at a state (see `contrast_spots`)."""
+    made = (
+        contrast_spots(replace(v, camera=state.cameras[v.second]), level, state.motions[v.tooth])
+        for v in views
+    )
+    return [spots for spots in made if spots is not None]
 
 
 def score(views: Sequence[Facing], level: int, motion: Array) -> float:
@@ -163,24 +217,11 @@ def improved(views: Sequence[Facing], start: Array, centre: Array) -> Fit:
         for _ in range(steps):
             matrix, vector = np.zeros((6, 6)), np.zeros(6)
             for facing in views:
-                pixels, value, _, clear = _sampled(facing, level, motion)
-                if clear.sum() < LEAST / 2:
-                    continue
-                x, y = facing.values[level][clear], value[clear, 0]
-                x = (x - x.mean()) / max(float(x.std()), 1.0)
-                size = max(float(y.std()), 1.0)
-                off = x - (y - y.mean()) / size
-                slope = value[clear, 1:] / size
-                steep = (slope**2).sum(1)
-                noise = max(float(np.mean(off**2)), 0.05) * ALIKE
-                some = Spots(
-                    0, 0, 0, facing.points[clear],
-                    pixels[clear] + slope * (off / np.maximum(steep, 1e-6))[:, None],
-                    slope[:, :, None] * slope[:, None, :] / noise, 0.0, 0,
-                )  # fmt: skip
-                block = solving.block_of(some, State({0: motion}, (facing.camera,)), centre)
-                matrix += block.matrix[:6, :6]
-                vector += block.vector[:6]
+                spots = contrast_spots(facing, level, motion)
+                if spots is not None:
+                    block = solving.block_of(spots, motion, facing.camera, centre)
+                    matrix += block.matrix[:6, :6]
+                    vector += block.vector[:6]
             information = matrix
             drift = solving.displacement(motion, centre)
             change = np.linalg.solve(matrix + PRIOR, vector - PRIOR @ drift)

@@ -7,7 +7,7 @@ distances between where spots are seen and where they should be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,9 +58,16 @@ class Block:
     weight: float
 
 
-def block_of(spots: Spots, state: State, centre: Array) -> Block:
+def blocks_of(spots: Iterable[Spots], state: State, centres: Mapping[int, Array]) -> list[Block]:
+    """Linearise the spots of several teeth and pairs of photographs (see `block_of`)."""
+    return [
+        block_of(s, state.motions[s.tooth], state.cameras[s.second], centres[s.tooth])
+        for s in spots
+    ]
+
+
+def block_of(spots: Spots, motion: Array, camera: Camera, centre: Array) -> Block:
     """Linearise: the tooth turns about `centre` [3] (as it was), the camera about itself."""
-    motion, camera = state.motions[spots.tooth], state.cameras[spots.second]
     world = spots.points @ motion[:3, :3].T + motion[:3, 3]
     about = world - (motion[:3, :3] @ centre + motion[:3, 3])
     local = world @ camera.rotation.T + camera.translation
