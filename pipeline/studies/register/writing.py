@@ -20,8 +20,9 @@ from pipeline.studies.register.visit import Look, said_of_shared
 Array = npt.NDArray[np.float64]
 FORMAT = "dentalsplat register 1"
 NOTES = {
-    "frame": "the first visit's, millimetres, OpenCV axes as its run found them, its lengths times "
-    "first_scaled_by (other than 1 where the second run's millimetre is the surer one); "
+    "frame": "the first visit's, millimetres, the axes those of its run (y leads up where teeth "
+    "placed the photographs, mostly down else), its lengths times first_scaled_by (other than 1 "
+    "where the second run's millimetre is the surer one); "
     "first_from_second leads there from the second's, 'at' and 'motion' are in it",
     "relative_scale": "size of the second run's millimetre in the first's, as the runs have them",
     "scale_deviation_percent": "null: how far the millimetres may be off is not known",
