@@ -105,8 +105,8 @@ def test_an_extension_for_good_fits_alone_is_refused() -> None:
 
 def test_what_no_fit_can_begin_with_is_refused() -> None:
     for setting in (
-        {"near": 1.0}, {"light_widths": (200, 0)}, {"light_widths": (-5, 25)},
-        {"light_strengths": (0, 0.04)}, {"light_strengths": (0.5, 2)},
+        {"near": 1.0}, {"detail_rounds": 10**6}, {"light_widths": (200, 0)},
+        {"light_widths": (-5, 25)}, {"light_strengths": (0, 0.04)}, {"light_strengths": (0.5, 2)},
     ):  # fmt: skip
         with pytest.raises(ValidationError, match="Input should be"):
             FitConfig(**setting)

@@ -46,7 +46,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         # three photographs of a street gain 3 dB and .2 of their sharpness by it, three real ones
         # of teeth .1 of it with hardly more Gaussians; unseen views stay. Twelve views,
         # which densification serves, gain nothing
-        detail_rounds: AutoInt = automatic({5: 2, 6: 0}, held=2)
+        detail_rounds: AutoInt = automatic({5: 2, 6: 0}, held=2, le=1000)
         """and so many times more at full size"""
         # more between few views gains nothing and costs time; from six on, textured scenes use it
         detail_density: AutoFloat = automatic({5: 0.3, 6: 0.6}, ge=None, gt=0)
