@@ -89,6 +89,15 @@ PHONE = """
   result.dock = box("footer.dock").top - box("#panel").bottom;
   result.lines = box("#said").width > 300;
   result.tops = tops.map(Math.round);
+"""
+LONG = """
+  await resized(320, 560);
+  document.querySelector("#next summary").click();
+  await settled();
+  const close = box("#next > button");
+  result.next = [box("#next").top >= 0, box("#panel").top >= -1, close.top >= 0];
+  result.beside = [...document.querySelector("#next > b").getClientRects()]
+    .every((line) => line.right <= close.left || line.top >= close.bottom);
   tell(result);
 })();
 """
@@ -98,7 +107,7 @@ PHONE = """
 def test_on_a_phone_the_chosen_crown_stays_in_sight(tmp_path: Path) -> None:
     workspace = doubtful_case(tmp_path / "case")
     run_report(workspace)
-    script = BEGIN.removeprefix("<script>") + PHONE
+    script = BEGIN.removeprefix("<script>") + PHONE + SAVE + LONG
     folder = tmp_path / "browser"
     folder.mkdir()
     page = (workspace / "check.html").read_text()
@@ -109,6 +118,8 @@ def test_on_a_phone_the_chosen_crown_stays_in_sight(tmp_path: Path) -> None:
     assert result["low"] > 0, "the panel covers no crown that is chosen"
     assert "is no FDI number" in result["said"]
     assert abs(result["dock"]) <= 1 and result["lines"], "the panel ends where the buttons begin"
+    assert result["next"] == [True] * 3, "what is to be done now can be read, and closed"
+    assert result["beside"], "its first line is not under the button"
 
 
 KEYS = """

@@ -347,11 +347,11 @@ const save = async () => {
     }
   } }, "Copy");
   find("next").replaceChildren(
-    make("b", {}, `${data.file} is ${how}. Two steps to go:`),
     make("button", { type: "button", onclick: () => {
       find("next").hidden = true;
       find("save").focus();
     } }, "Close"),
+    make("b", {}, `${data.file} is ${how}. Two steps to go:`),
     make("ol", {},
       make("li", {}, data.target ? `Put it in the place of ${data.target}`
         : "Put it into the workspace folder, beside this page",
