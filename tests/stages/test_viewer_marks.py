@@ -92,6 +92,11 @@ DRAWN = """(async () => {
     page.render();
     result.numbers.push(`${page.state.axis}: ${numbers().join(" ")}`);
   }
+  const slider = () => [$("opacity").disabled, $("opacity").value];
+  press("d"); press("p");
+  result.slider = [slider()];
+  press("d"); press("p");
+  result.slider.push(slider());
   press("m");
   result.crosshair = [crosshair()];
   for (const element of [$("more"), canvas]) {
@@ -111,6 +116,7 @@ def test_what_is_drawn_is_of_what_is_there(tmp_path: Path) -> None:
     assert found["numbers"] == [
         "off: 11 41", "height: 41", "depth: ", "across: 11 41", "off: 11 41",
     ], "no numbers of teeth that are cut away"  # fmt: skip
+    assert found["slider"] == [[True, "0"], [False, "100"]], "two panes have no photograph"
     assert found["crosshair"] == [True, False, True], "it is there while the keys are the scene's"
 
 

@@ -45,6 +45,7 @@ function showHelp(shown) {
 }
 
 function showPhoto(viewer, share) {
+  if (byId("opacity").disabled) return;
   const views = viewer.scene.views;
   if (viewer.view < 0) viewer.goTo(viewer.nearestView());
   if (!views[viewer.view].photo) return;

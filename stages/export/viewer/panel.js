@@ -114,6 +114,7 @@ function addPanel(viewer, tools) {
     for (const key of ["numbers", "jaw", "axis"]) byId(key).value = now[key];
     for (const key of ["support", "mesh", "sides"]) byId(key).checked = now[key];
     byId("legend").hidden = !now.support;
+    byId("opacity").disabled = now.sides;  // there is no photograph of two panes
     byId("at").value = Math.round(100 * now.at);
     byId("at").closest("label").hidden = now.axis === "off";
     for (const button of byId("measured").querySelectorAll("button")) {
