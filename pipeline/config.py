@@ -29,6 +29,14 @@ _MOST_PARTS, _LONGEST_NAME, _LONGEST_CHAIN, _MOST_FAULTS = 8, 200, 20, 5
 _ALTERNATIVE = re.compile(
     r"((literal|tuple)\[.*\]|constrained-\w+|function-.*|int|float|bool|str|none)$"
 )
+#: pydantic's name of a fault -> what a value may be, where its own words are Python's
+_MAY_BE = {
+    "tuple_type": "a list, as in [a, b]", "list_type": "a list, as in [a, b]",
+    "dict_type": "entries, as in {a: b}", "model_type": "a section, as in {name: value}",
+    "path_type": "a path", "string_type": "text", "bool_type": "true or false",
+    "bool_parsing": "true or false", "int_type": "a whole number", "int_parsing": "a whole number",
+    "int_from_float": "a whole number", "float_type": "a number", "float_parsing": "a number",
+}  # fmt: skip
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -355,8 +363,9 @@ def _one_each(faults: Sequence[Any]) -> list[Any]:
     found: dict[tuple[Any, ...], Any] = {}
     for fault in faults:
         place = tuple(part for part in fault["loc"] if not _ALTERNATIVE.match(str(part)))
-        first = found.setdefault(place, {**fault, "loc": place})
-        other = str(fault["msg"]).removeprefix("Input should be ")
+        other = _MAY_BE.get(fault["type"], str(fault["msg"]).removeprefix("Input should be "))
+        said = f"Input should be {other}" if fault["type"] in _MAY_BE else fault["msg"]
+        first = found.setdefault(place, {**fault, "loc": place, "msg": said})
         if other not in first["msg"]:
             first["msg"] = f"{first['msg']}, or {other}"
     wholes = {place[:n] for place in found for n in range(len(place))}

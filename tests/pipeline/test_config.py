@@ -75,6 +75,25 @@ def test_real_quantile_out_of_range_is_refused() -> None:
         load_config(None, ["sap.quantile=7"])
 
 
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("views.held_out=003.jpg", "should be a list, as in [a, b]. It means"),
+        ("fit.iterations=many", "should be 'auto', or a whole number. It means"),
+        ("fit.background=1", "should be 'auto', or a list, as in [a, b]. It means"),
+        ("init.length=null", "should be a section, as in {name: value}. It means"),
+        ("init.dental.tooth_widths=8.6", "should be entries, as in {a: b}. It means"),
+        ("views.masks=[1]", "should be a path. It means"),
+        ("export.video=maybe", "should be true or false. It means"),
+        ("export.mesh_faces=5.5", "should be a whole number. It means"),
+    ],
+)
+def test_a_value_of_another_kind_is_refused_in_no_words_of_python(override: str, told: str) -> None:
+    with pytest.raises(RequestError) as caught:
+        load_config(None, [override])
+    assert told in str(caught.value)
+
+
 def test_runtime_fields_stay_out_of_the_result(toys: Path) -> None:
     section = load_config(toys / "toy.yaml").sections["scale"]
     assert result_fields(section) == {"factor": 2.0, "note": False, "round": False}
