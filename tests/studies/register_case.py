@@ -58,11 +58,25 @@ def texture(points: np.ndarray, seed: int) -> np.ndarray:
     return 0.6 + 0.025 * np.sin(points @ waves.T + rng.uniform(0, 6.3, 24)).sum(1) / 2
 
 
+def shaded(points: np.ndarray, normals: np.ndarray, seed: int) -> np.ndarray:
+    """[N] brightness of smooth enamel with faint sharp marks, at points [N, 3] of a crown's frame.
+
+    Args:
+        points: mm.
+        normals: [N, 3] in the camera's frame: the light goes with the camera, whatever a tooth did.
+        seed: of the marks.
+    """
+    waves = np.random.default_rng(seed).normal(size=(24, 3))
+    waves *= 8.0 / np.linalg.norm(waves, axis=1, keepdims=True)
+    light = np.sin(normals @ np.array([[3.0, 1.0, 0.0], [-1.0, 4.0, 0.0], [6.0, 5.0, 0.0]]).T)
+    return 0.5 + 0.1 * light.sum(1) + 0.012 * np.sin(points @ waves.T).sum(1) / 2
+
+
 def photograph(
     camera: Camera, centres: Mapping[int, np.ndarray], motions: Mapping[int, np.ndarray],
-    patient: int, noise: int,
+    patient: int, noise: int, smooth: bool = False,
 ) -> Look:  # fmt: skip
-    """Render balls with what each did since the first visit ([4, 4])."""
+    """Render balls with what each did since the first visit ([4, 4]); see `texture`, `shaded`."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([(u - camera.cx) / FOCAL, (v - camera.cy) / FOCAL, np.ones_like(u)], -1)
     rays = rays.reshape(-1, 3) @ camera.rotation  # in the world, 1 long along the axis
@@ -79,8 +93,12 @@ def photograph(
         z = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
         nearer = z < depth
         depth[nearer], labels[nearer] = z[nearer], number
-        points = camera.centre + z[nearer, None] * rays[nearer]
-        image[nearer] = texture((points - now) @ motion[:3, :3], 1000 * patient + number)
+        points = camera.centre + z[nearer, None] * rays[nearer] - now
+        own, seed = points @ motion[:3, :3], 1000 * patient + number
+        if smooth:
+            image[nearer] = shaded(own, points / RADIUS @ camera.rotation.T, seed)
+        else:
+            image[nearer] = texture(own, seed)
     grain = np.random.default_rng(noise).normal(0, 0.004, len(image))
     shape = HEIGHT, WIDTH
     return Look(
@@ -91,8 +109,9 @@ def photograph(
 
 
 def toy_visit(
-    name: str, motions: Mapping[int, np.ndarray] | None = None, patient: int = 1, turn: float = 0.0
-) -> Visit:
+    name: str, motions: Mapping[int, np.ndarray] | None = None, patient: int = 1,
+    turn: float = 0.0, smooth: bool = False,
+) -> Visit:  # fmt: skip
     """A visit of four photographs.
 
     Args:
@@ -100,6 +119,7 @@ def toy_visit(
         motions: what teeth did since the first visit.
         patient: another one has other surfaces, and teeth a little elsewhere.
         turn: degrees that the photographs are taken from further left.
+        smooth: whether crowns have faint marks under light that goes with the camera.
     """
     centres = toy_centres()
     if patient != 1:
@@ -112,6 +132,7 @@ def toy_visit(
             motions or {},
             patient,
             97 * len(name) + k,
+            smooth,
         )
         for k, yaw in enumerate((-42.0, -14.0, 14.0, 42.0))
     )

@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.geometry.rigid import exponential
 from pipeline.studies.register import comparing, movement, solving
 from pipeline.studies.register.both_ways import agreed, mirrored
 from pipeline.studies.register.comparing import compare_visits
-from pipeline.studies.register.estimate import Estimate, Started, compared_pairs, started
+from pipeline.studies.register.estimate import (
+    Estimate,
+    Started,
+    compared_pairs,
+    finished,
+    started,
+)
 from pipeline.studies.register.geometry import first_frame
 from pipeline.studies.register.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
@@ -164,6 +171,34 @@ def test_contrast_itself_improves_what_few_photographs_show(
             off = solving.displacement(better[12], centre) - true
             assert solving.travel(off) < 0.1
             assert fits[12] > 0.8
+
+
+def test_marks_tell_turns_where_shading_stays_with_the_light(motions: dict) -> None:
+    """Flow takes shading along; where there are no marks what it says is kept."""
+    first, second = (
+        toy_visit("first", smooth=True),
+        toy_visit("second", motions, turn=3.0, smooth=True),
+    )
+    still = sorted(set(first.teeth) - set(motions))
+    begun = started(first, second, np.eye(4), still)
+    rng = np.random.default_rng(3)
+    blank = tuple(
+        replace(p, marks=rng.integers(88, 168, p.marks.shape, np.uint8)) for p in begun.first
+    )
+    off = {
+        name: np.array([turned_off(found, motions, n) for n in motions])
+        for name, found in (
+            ("marks", finished(begun)), ("no marks", finished(replace(begun, first=blank))),
+        )
+    }  # fmt: skip
+    assert (off["no marks"] > 1.0).all()
+    assert (off["marks"] < 0.75 * off["no marks"]).all()
+
+
+def turned_off(found: Estimate, motions: dict, tooth: int) -> float:
+    """By how much the turn that came out for a tooth is off, degrees."""
+    turns = [m[:3, :3] for m in (found.state.motions[tooth], motions[tooth])]
+    return float(np.degrees(Rotation.from_matrix(turns[0].T @ turns[1]).magnitude()))
 
 
 def with_motion(found: Started, tooth: int, motion: np.ndarray) -> Started:

@@ -56,6 +56,8 @@ LEAST_SPOTS = 120
 #: Rounds of laying marks onto each other, by their blur (see `photometric.MARK_BLURS`), steps of
 #: each, and points of a crown in a pair of photographs and pairs at most.
 MARK_ROUNDS, MARK_STEPS, MARK_POINTS, MARK_PAIRS = (0, 1, 1, 1), 3, 1000, 24
+#: Marks tell what a tooth did if they correlate by this at the end.
+LEAST_AGREEMENT = 0.15
 
 
 @dataclass(frozen=True)
@@ -181,17 +183,28 @@ def by_marks(
     a, b = Marks(found.first), Marks(found.second)
     pairs = compared_pairs(found.first, state)
     teeth = sorted({s.tooth for s in spots if len(s.points)})
-    factor, made = 1.0, list(spots)
+    laid, factor, made = state, 1.0, list(spots)
     for level in MARK_ROUNDS:
         views = [v for n in teeth for v in facings(n, a, b, state, pairs, MARK_POINTS, MARK_PAIRS)]
         for _ in range(MARK_STEPS):
             made = [
                 replace(s, information=s.information * factor)
-                for s in mark_spots(views, level, state)
+                for s in mark_spots(views, level, laid)
             ]
-            state = _step(made, state, found.centres, still, found.laid)
-        factor /= noise(made, state, found.centres, still)
-    return state, made
+            laid = _step(made, laid, found.centres, still, found.laid)
+        factor /= noise(made, laid, found.centres, still)
+    agree = {n for n in teeth if agreement([s for s in made if s.tooth == n]) >= LEAST_AGREEMENT}
+    motions = {n: (laid if n in agree else state).motions[n] for n in state.motions}
+    return replace(laid, motions=motions), [
+        *(s for s in made if s.tooth in agree),
+        *(s for s in spots if s.tooth not in agree),
+    ]
+
+
+def agreement(spots: Sequence[Spots]) -> float:
+    """Mean correlation of a crown's pictures, by the pixels that were compared; -1 without any."""
+    seen = sum(s.seen for s in spots)
+    return sum(s.likeness * s.seen for s in spots) / seen if seen else -1.0
 
 
 def calibrated(laid: dict[int, Laid], agreeing: Sequence[int]) -> dict[int, Laid]:
