@@ -56,8 +56,9 @@ LEAST_SPOTS = 120
 #: Rounds of laying marks onto each other, by their blur (see `photometric.MARK_BLURS`), steps of
 #: each, and points of a crown in a pair of photographs and pairs at most.
 MARK_ROUNDS, MARK_STEPS, MARK_POINTS, MARK_PAIRS = (0, 1, 1, 1), 3, 1000, 24
-#: Marks tell what a tooth did if they correlate by this at the end.
-LEAST_AGREEMENT = 0.15
+#: Marks tell what a tooth did if they correlate by this at the end. Of a generated mouth they do by
+#: .46 and more at the motions found, and .6 mm off by .47 at most.
+LEAST_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -156,9 +157,11 @@ def finished(found: Started) -> Estimate:
         for _ in range(STEPS):
             state = _step(spots, state, centres, still, laid)
         factor /= noise(spots, state, centres, still)
-    state, marks = by_marks(found, state, still, spots)
-    blocks = solving.blocks_of(marks, state, centres)
     seen, fits = judged(a, b, state, still, centres, compared_pairs(a, state))
+    state = replace(state, motions={**state.motions, **seen})
+    state, marks, told = by_marks(found, state, still, spots)
+    seen = {n: motion for n, motion in seen.items() if n not in told}
+    blocks = solving.blocks_of(marks, state, centres)
     likeness = weighted_median([s.likeness for s in spots], [s.seen for s in spots])
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
     return Estimate(
@@ -169,8 +172,8 @@ def finished(found: Started) -> Estimate:
 
 def by_marks(
     found: Started, state: State, still: Sequence[int], spots: Sequence[Spots]
-) -> tuple[State, list[Spots]]:
-    """Lay the marks of the crowns onto each other, and what they say at the end.
+) -> tuple[State, list[Spots], set[int]]:
+    """Lay the marks of the crowns onto each other, what they say at the end, and of which teeth.
 
     Optical flow needs a window that takes shading in, which stays with the light when a tooth
     turns. Once it has found the place to a pixel, the finest contrast alone tells the rest. Crowns
@@ -193,12 +196,12 @@ def by_marks(
             ]
             laid = _step(made, laid, found.centres, still, found.laid)
         factor /= noise(made, laid, found.centres, still)
-    agree = {n for n in teeth if agreement([s for s in made if s.tooth == n]) >= LEAST_AGREEMENT}
-    motions = {n: (laid if n in agree else state).motions[n] for n in state.motions}
-    return replace(laid, motions=motions), [
-        *(s for s in made if s.tooth in agree),
-        *(s for s in spots if s.tooth not in agree),
-    ]
+    told = {n for n in teeth if agreement([s for s in made if s.tooth == n]) >= LEAST_AGREEMENT}
+    motions = {n: (laid if n in told else state).motions[n] for n in state.motions}
+    said = [
+        *(s for s in made if s.tooth in told), *(s for s in spots if s.tooth not in told)
+    ]  # fmt: skip
+    return replace(laid, motions=motions), said, told
 
 
 def agreement(spots: Sequence[Spots]) -> float:
