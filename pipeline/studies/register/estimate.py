@@ -186,9 +186,9 @@ def by_marks(
     a, b = Marks(found.first), Marks(found.second)
     pairs = compared_pairs(found.first, state)
     teeth = sorted({s.tooth for s in spots if len(s.points)})
+    views = [v for n in teeth for v in facings(n, a, b, state, pairs, MARK_POINTS, MARK_PAIRS)]
     laid, factor, made = state, 1.0, list(spots)
     for level in MARK_ROUNDS:
-        views = [v for n in teeth for v in facings(n, a, b, state, pairs, MARK_POINTS, MARK_PAIRS)]
         for _ in range(MARK_STEPS):
             made = [
                 replace(s, information=s.information * factor)
