@@ -196,7 +196,7 @@ def by_marks(
             ]
             laid = _step(made, laid, found.centres, still, found.laid)
         factor /= noise(made, laid, found.centres, still)
-    told = {n for n in teeth if agreement([s for s in made if s.tooth == n]) >= LEAST_AGREEMENT}
+    told = {n for n in teeth if told_by([s for s in made if s.tooth == n])}
     motions = {n: (laid if n in told else state).motions[n] for n in state.motions}
     said = [
         *(s for s in made if s.tooth in told), *(s for s in spots if s.tooth not in told)
@@ -204,10 +204,15 @@ def by_marks(
     return replace(laid, motions=motions), said, told
 
 
-def agreement(spots: Sequence[Spots]) -> float:
-    """Mean correlation of a crown's pictures, by the pixels that were compared; -1 without any."""
+def told_by(spots: Sequence[Spots]) -> bool:
+    """Do its marks tell what a tooth did?
+
+    Of one photograph they don't: how far it went along the line of sight hangs on its depth, which
+    is off by more than marks are.
+    """
     seen = sum(s.seen for s in spots)
-    return sum(s.likeness * s.seen for s in spots) / seen if seen else -1.0
+    likeness = sum(s.likeness * s.seen for s in spots)
+    return len({s.second for s in spots}) > 1 and likeness >= LEAST_AGREEMENT * seen
 
 
 def calibrated(laid: dict[int, Laid], agreeing: Sequence[int]) -> dict[int, Laid]:
