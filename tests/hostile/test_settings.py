@@ -158,7 +158,7 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
             "fit.light_widths=[30] is not allowed: There are too few values.",
         ),
         ("fit.light_widths=[30, 20, 10]", "is not allowed: List should have at most 2 items"),
-        ("fit.light_widths=3", "Input should be a valid list"),
+        ("fit.light_widths=3", "Input should be a list, as in [a, b]"),
         ("init.length.start=[1]", "init.length.start=[1] is not allowed: There are too few"),
         ("init.min_tri_angle=0", "init.min_tri_angle=0 is not allowed"),
         ("init.max_reprojection_error=0.01", "init.max_reprojection_error=0.01 is not allowed"),

@@ -125,17 +125,23 @@ SAVED = """(async () => {
   let blob = null;
   URL.createObjectURL = (given) => { blob = given; return "blob:x"; };
   HTMLAnchorElement.prototype.click = () => {};
+  const until = async (there) => {
+    while (!there()) {  // drawing takes true time: virtual time alone would be over before
+      await new Promise((done) => setTimeout(done, 10));
+      page.render();
+    }
+  };
   const saved = async () => {
     blob = null;
     press("s");
-    while (!blob) {
-      await new Promise((done) => setTimeout(done, 50));
-      page.render();  // virtual time would be over before the picture is there
-    }
+    await until(() => blob);
+    let bitmap = null;
+    createImageBitmap(blob).then((made) => { bitmap = made; });
+    await until(() => bitmap);
     const { width, height } = canvas;
     const brush = Object.assign(document.createElement("canvas"), { width, height })
       .getContext("2d");
-    brush.drawImage(await createImageBitmap(blob), 0, 0);
+    brush.drawImage(bitmap, 0, 0);
     const picture = brush.getImageData(0, 0, width, height).data;
     const scene = page.pixels();
     let [off, left, right, top, bottom] = [0, width, 0, height, 0];
