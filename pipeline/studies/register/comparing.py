@@ -26,8 +26,8 @@ Array = npt.NDArray[np.float64]
 #: benchmarks/register.py --calibrate. With many photographs turns have a large factor: what shading
 #: does to all of them alike shows in none of the jackknives. Of three photographs, rotation is the
 #: least sure: crowns are round about their length, so that their shape does not tell it.
-FACTORS = {"few": (1.7, 1.4), "many": (2.0, 5.5)}
-FLOORS = {"few": (0.15, 4.0, 6.0), "many": (0.1, 0.5, 0.75)}
+FACTORS = {"few": (2.0, 1.4), "many": (2.0, 5.5)}
+FLOORS = {"few": (0.2, 4.0, 6.0), "many": (0.1, 0.5, 0.75)}
 MANY = 6
 #: Share of the jackknife over photographs that counts. Of few photographs mostly one or two show a
 #: tooth: without them the estimate falls back to no motion, so that the jackknife says how far the
