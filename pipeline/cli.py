@@ -342,6 +342,7 @@ def command_line() -> int:
     debug = "--debug" in sys.argv
     try:
         status = app(standalone_mode=False)
+        sys.stdout.flush()  # an answer that finds no room is said now, not as the interpreter ends
     except PipelineError as error:
         status = signals.STATUS if signals.asked() else _fail(error, error.exit_status, debug)
     except (KeyboardInterrupt, typer.Abort):
@@ -349,11 +350,20 @@ def command_line() -> int:
     except SystemExit as error:  # typer turns an interrupt into one of these
         status = error.code if isinstance(error.code, int) else int(bool(error.code))
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _let_go_of_answer()
         status = 0
     except Exception as error:
         status = signals.STATUS if signals.asked() else _unexpected(error, debug)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _let_go_of_answer()
     return status if isinstance(status, int) else 0
+
+
+def _let_go_of_answer() -> None:
+    """What could not be written is not tried again at the end (which has a status of its own)."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(error: BaseException, status: int, debug: bool) -> int:
