@@ -377,8 +377,7 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
     location = [
         str(part) if len(str(part)) <= _LONGEST_NAME else shown(part) for part in error["loc"]
     ]
-    why = error["msg"].removeprefix("Value error, ")
-    why = why.replace("Tuple", "List").replace("valid tuple", "valid list")
+    why = error["msg"].removeprefix("Value error, ").replace("Tuple should", "List should")
     if error["type"] == "missing" and location[-1].isdigit():
         location, why = location[:-1], "There are too few values"
     dotted = ".".join(filter(None, [section, *location]))

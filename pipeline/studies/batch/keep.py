@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.files import fsync_tree, temporary_beside
+from pipeline.files import fsync_tree, temporary_beside, write_atomic
 from pipeline.pages.page import CHECK, REPORT
 from pipeline.stage import stage_names
 from pipeline.store import Store
@@ -111,7 +111,7 @@ def _tell(readme: Path, left_out: Sequence[str]) -> None:
     """Say at the end of the list of files, if there is one, which of them were left out."""
     if left_out and readme.is_file():
         said = f"Left out by 'pipeline batch --keep results': {', '.join(left_out)}."
-        _replace(readme, f"{readme.read_text()}\n{textwrap.fill(said, 100)}\n")
+        write_atomic(readme, f"{readme.read_text()}\n{textwrap.fill(said, 100)}\n")
 
 
 def _unlink_missing(report: Path) -> None:
@@ -122,13 +122,7 @@ def _unlink_missing(report: Path) -> None:
             lambda link: link[0] if is_there(report.parent / link[1]) else "", before
         )
         if after != before:
-            _replace(report, after)
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = temporary_beside(path)
-    temporary.write_text(text)
-    temporary.replace(path)
+            write_atomic(report, after)
 
 
 def _rank(path: Path) -> tuple[int, str]:

@@ -23,9 +23,10 @@ Array = npt.NDArray[np.float64]
 #: six photographs and with more; and what it never falls below: shifts (mm), tip and torque, and
 #: rotation (degrees). Chosen on generated mouths so that a tooth's shift and its turn are both
 #: covered in 95 % of the teeth, of those that moved alone as well, and so are 95 % of the parts:
-#: benchmarks/register.py --calibrate. With many photographs turns have a large factor: what shading
-#: does to all of them alike shows in none of the jackknives. Of three photographs, rotation is the
-#: least sure: crowns are round about their length, so that their shape does not tell it.
+#: benchmarks/register.py --calibrate. With many photographs turns have a large factor: what does
+#: the same to all of them (shading, where marks are few) shows in none of the jackknives. Of three
+#: photographs, rotation is the least sure: crowns are round about their length, so that their shape
+#: does not tell it.
 FACTORS = {"few": (2.0, 1.4), "many": (2.0, 5.5)}
 FLOORS = {"few": (0.2, 4.0, 6.0), "many": (0.1, 0.5, 0.75)}
 MANY = 6

@@ -24,6 +24,7 @@ from pipeline.studies.register.matching import (
 from pipeline.studies.register.movement import tooth_axes
 from pipeline.studies.register.photometric import (
     FITS,
+    PRIOR,
     Marks,
     facings,
     judged,
@@ -49,8 +50,6 @@ STILL, TIMES = 0.1, 2.5
 FIRM = 0.01
 #: How far teeth move, mm, and from how far on a start by shape alone is taken.
 EXPECTED, CLEAR = 0.5, 0.3
-#: What a tooth does between two visits: 1 mm, 6 degrees (standard deviations).
-PRIOR = np.diag([1.0] * 3 + [1 / np.radians(6.0) ** 2] * 3)
 #: A tooth is measured if it has so many spots in all.
 LEAST_SPOTS = 120
 #: Rounds of laying marks onto each other, by their blur (see `photometric.MARK_BLURS`), steps of
@@ -68,15 +67,15 @@ class Estimate:
     Attributes:
         state: motions of the first visit's teeth, and the second's cameras in its frame.
         still: numbers of the teeth that stood still.
-        blocks: normal equations at the end.
-        spots: behind them.
+        blocks: normal equations at the end, of the marks of crowns or else of `spots`.
+        spots: what optical flow found at the end.
         laid: what the crowns' shapes say of their motions.
         centres: FDI number -> [3] centre of the crown at the first visit, mm.
         likeness: median correlation of the crowns' surroundings, at the end.
         residual: median distance of crowns from crowns, laid onto each other, mm.
         first_from_second: [4, 4] similarity of the two visits' frames.
         seen: FDI number -> [4, 4] motion of a tooth that moved, by which its few pictures fit
-            better than by `state` (see `photometric.judged`).
+            better than by what flow says (see `photometric.judged`), where marks tell nothing.
         fits: FDI number -> correlation of the tooth's pictures by its motion, -1..1.
     """
 
@@ -173,7 +172,7 @@ def finished(found: Started) -> Estimate:
 def by_marks(
     found: Started, state: State, still: Sequence[int], spots: Sequence[Spots]
 ) -> tuple[State, list[Spots], set[int]]:
-    """Lay the marks of the crowns onto each other, what they say at the end, and of which teeth.
+    """Lay the marks of the crowns onto each other.
 
     Optical flow needs a window that takes shading in, which stays with the light when a tooth
     turns. Once it has found the place to a pixel, the finest contrast alone tells the rest. Crowns
@@ -181,7 +180,13 @@ def by_marks(
 
     Args:
         found: the photographs, and what else is known of the teeth.
-        state, still, spots: what flow says.
+        state: the motions and cameras that flow leads to; those of crowns may be a pixel off.
+        still: numbers of the teeth that stood still.
+        spots: that flow found.
+
+    Returns:
+        The state by the marks; the spots that it rests on, those of flow where marks do not tell;
+        the numbers of the teeth of which they do.
     """
     a, b = Marks(found.first), Marks(found.second)
     pairs = compared_pairs(found.first, state)

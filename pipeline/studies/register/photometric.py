@@ -4,6 +4,10 @@ Optical flow finds the nearest motion that explains a picture, and on a smooth c
 do. So the motion of a tooth is improved on the contrast of its pictures itself, and where that fits
 badly it is tried from several turns and shifts; the correlation over all pairs of photographs
 chooses.
+
+What contrast over several pixels takes along is shading, which stays with the light when a tooth
+turns. Within a pixel or two it is marks of the enamel (`Marks`): they tell turns, once a crown is
+found to a pixel.
 """
 
 from __future__ import annotations
@@ -117,7 +121,15 @@ def facings(
     tooth: int, a: Pictures, b: Pictures, state: State, pairs: Sequence[tuple[int, int]],
     most_points: int = POINTS, most: int = PAIRS,
 ) -> list[Facing]:  # fmt: skip
-    """The crown in the pairs of photographs that show it, where it is largest first."""
+    """The crown in the pairs of photographs that show it, where it is largest first.
+
+    Args:
+        tooth: FDI number.
+        a, b: pictures of the first and the second visit.
+        state: of which the tooth's motion and the cameras count.
+        pairs: indices of the photographs.
+        most_points, most: points of the crown in each pair, and pairs, at most.
+    """
     found, sizes = [], []
     motion = state.motions[tooth]
     for i, j in pairs:
@@ -166,7 +178,14 @@ def contrast_spots(facing: Facing, level: int, motion: Array) -> Spots | None:
     """Where a crown's points would look as they do in the first photograph (Lucas and Kanade).
 
     Each is as sure as the picture is steep there; along an edge nothing is said.
-    None where too few are seen.
+
+    Args:
+        facing: the crown in a pair of photographs.
+        level: which of its blurs.
+        motion: [4, 4] of the tooth in the first visit's frame, mm.
+
+    Returns:
+        Spots, their `likeness` the correlation of the pictures; None where too few are seen.
     """
     pixels, value, _, clear = _sampled(facing, level, motion)
     if clear.sum() < LEAST / 2:
