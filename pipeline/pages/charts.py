@@ -234,7 +234,7 @@ def camera_plot(
                     away = away / max(float(np.linalg.norm(away)), 1e-12) * depth * 0.5
                     x, y = corners[0] + away
                     axes.text(
-                        x, y, _plain(camera.name), ha="center", va="center", fontsize=9,
+                        x, y, _ends(camera.name), ha="center", va="center", fontsize=9,
                         color=color,
                     )  # fmt: skip
         axes.use_sticky_edges = False

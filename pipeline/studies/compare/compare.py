@@ -166,7 +166,7 @@ def _compare(
     figures["tables"] = [table.described() for table in tables]
     write_json(folder / FILE, figures)
     write_atomic(folder / "comparison.md", markdown(tables))
-    write_report(folder / REPORT, figures, _series(entries, best, truth))
+    write_report(folder / REPORT, figures, _series(entries, best, truth), photo_names(views))
     if (home / REPORT).exists():  # it shows these tables
         try:
             run_report(home)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +21,31 @@ def write_report(
     out: Path,
     figures: Mapping[str, Any],
     cameras: Sequence[tuple[str, Sequence[Camera], Motion | None]],
+    photos: Mapping[str, str],
 ) -> None:
     """Write the page.
 
     Args:
         figures: what comparison.json says.
         cameras: title, cameras and what brings them into the world of the last ones.
+        photos: as `colmap_run.photo_names` has them.
     """
+    named = [
+        (title, [_named(camera, photos) for camera in found], motion)
+        for title, found, motion in cameras
+    ]
     write_page(
         "pipeline.studies.compare", "compare.html", out,
         title=Path(figures["workspace"]).resolve().name,
         figures=figures,
         tables=[compared_table(described) for described in figures["tables"]],
-        charts=_charts(figures, cameras),
+        charts=_charts(figures, named),
     )  # fmt: skip
+
+
+def _named(camera: Camera, photos: Mapping[str, str]) -> Camera:
+    """A camera that is called like its photograph, where that is known."""
+    return replace(camera, name=Path(photos.get(f"{camera.name}.png", camera.name)).stem)
 
 
 def _charts(
