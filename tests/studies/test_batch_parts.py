@@ -11,10 +11,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from pipeline import run
+from pipeline.artifacts.space.frames import Frame
+from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.files import sha256_file, write_json
 from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
@@ -25,6 +28,7 @@ from pipeline.studies.batch.records import Case, new_record, write_case
 from pipeline.studies.batch.sources import contents_of, settings_of
 from pipeline.studies.batch.summary import MEASURED, csv_text, write_summary
 from stages.export.measuring.measures import RULES
+from stages.export.texts import scene_description
 from tests.browser import needs_chromium, run_in
 
 DATA = Path(__file__).resolve().parents[2] / "data_samples"
@@ -324,3 +328,23 @@ def test_what_a_case_is_kept_for_may_take_more_room_than_the_rest(tmp_path: Path
     assert sorted(keep_results(tmp_path)) == ["check.html", "mesh.glb"]
     assert {path.name for path in results.iterdir()} == {"viewer.html", "mesh.ply", "scene.json"}
     assert (tmp_path / "report.html").is_file() and not (tmp_path / "check.html").exists()
+
+
+def test_scene_json_says_what_was_left_out_and_no_jaw_is_kept_alone(tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    (tmp_path / "export").mkdir()
+    results.symlink_to("export")
+    jaws = [f"mesh_{jaw}.glb" for jaw in ("lower", "upper")]
+    sizes = {"mesh.ply": 4_000_000, jaws[0]: 3_000_000, jaws[1]: 3_500_000, "preview.png": 900_000}
+    for name, size in sizes.items():
+        (results / name).write_bytes(bytes(size))
+    frame, scale = Frame("mouth", np.eye(4)), Scale("mm", "length", 2.0)
+    before = scene_description([*sizes], frame, scale, (0, 1, 0), {}, {"model": "open"}, {})
+    assert set(jaws) <= before["files"].keys() & before["frame"]["file_from_frame"].keys()
+    write_json(results / "scene.json", before)
+    assert sorted(keep_results(tmp_path)) == jaws
+    assert {path.name for path in results.iterdir()} == {"mesh.ply", "preview.png", "scene.json"}
+    told = json.loads((results / "scene.json").read_text())
+    assert set(told["files"]) == {"mesh.ply", "preview.png"}
+    assert set(told["skipped"]) == {"model", *jaws}
+    assert not set(jaws) & told["frame"]["file_from_frame"].keys()

@@ -7,9 +7,10 @@ import shutil
 import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import groupby
 from pathlib import Path
 
-from pipeline.files import fsync_tree, temporary_beside, write_atomic
+from pipeline.files import fsync_tree, read_json, temporary_beside, write_atomic, write_json
 from pipeline.pages.page import CHECK, REPORT
 from pipeline.stage import stage_names
 from pipeline.store import Store
@@ -35,6 +36,8 @@ THUMBNAIL = 160
 _WORKING = (REQUEST, "pages.json", ".lock", "profile")
 #: A link of the report to a file in `results/`.
 _RESULT_LINK = re.compile(r'<li[^>]*><a href="(results/[^"]+)">[^<]*</a></li>')
+#: What scene.json calls itself.
+SCENE = "dentalsplat export 2"
 #: What is kept while it is made, when it is whole, and while a new run may replace it.
 _MAKING, _MADE, _BEFORE = ".results.part", ".results", ".results.before"
 
@@ -53,7 +56,7 @@ def keep_results(workspace: Path) -> list[str]:
         remove(making)
         making.mkdir()
         left_out = _copy_within(results, workspace, making)
-        _tell(making / "README.txt", sorted(set(left_out) - {REPORT, CHECK}))
+        _tell(making, sorted(set(left_out) - {REPORT, CHECK}))
         fsync_tree(making)
         making.rename(made)
     if is_there(made):
@@ -90,28 +93,42 @@ def kept_aside(workspace: Path) -> Iterator[None]:
 
 
 def _copy_within(results: Path, workspace: Path, into: Path) -> list[str]:
-    """Copy results, most wanted first, as far as there is room; returns what was left out."""
+    """Copy results, most wanted first, as far as there is room; returns what was left out.
+
+    Of both jaws' meshes of one kind there are both or none.
+    """
     entries = list(results.iterdir())
     pages = [workspace / page for page in (REPORT, CHECK) if (workspace / page).is_file()]
     taken = 0
     left_out = []
-    for entry in sorted([*entries, *pages], key=_rank):
-        size = size_of(entry)
-        most = MOST_WANTED if _rank(entry)[0] < len(WANTED) else MOST_KEPT
-        if entry.is_dir() or taken + size > most:
-            left_out.append(entry.name)
+    for (rank, _), group in groupby(sorted([*entries, *pages], key=_rank), key=_rank):
+        together = list(group)
+        size = sum(map(size_of, together))
+        most = MOST_WANTED if rank < len(WANTED) else MOST_KEPT
+        if any(entry.is_dir() for entry in together) or taken + size > most:
+            left_out += [entry.name for entry in together]
             continue
         taken += size
-        if entry.parent == results:
-            _copy(entry, into / entry.name)
+        for entry in together:
+            if entry.parent == results:
+                _copy(entry, into / entry.name)
     return left_out
 
 
-def _tell(readme: Path, left_out: Sequence[str]) -> None:
-    """Say at the end of the list of files, if there is one, which of them were left out."""
+def _tell(results: Path, left_out: Sequence[str]) -> None:
+    """Say in both lists of files, for people and for programs, which were left out."""
+    readme, scene = results / "README.txt", results / "scene.json"
+    told = read_json(scene)
+    why = "Left out by 'pipeline batch --keep results'"
     if left_out and readme.is_file():
-        said = f"Left out by 'pipeline batch --keep results': {', '.join(left_out)}."
+        said = f"{why}: {', '.join(left_out)}."
         write_atomic(readme, f"{readme.read_text()}\n{textwrap.fill(said, 100)}\n")
+    if left_out and isinstance(told, dict) and told.get("format") == SCENE:
+        for listed in (told["files"], told["frame"]["file_from_frame"]):
+            for name in left_out:
+                listed.pop(name, None)
+        told["skipped"] |= dict.fromkeys(left_out, why)
+        write_json(scene, told)
 
 
 def _unlink_missing(report: Path) -> None:
@@ -126,9 +143,10 @@ def _unlink_missing(report: Path) -> None:
 
 
 def _rank(path: Path) -> tuple[int, str]:
+    """How much a file is wanted, and the name that it shares with that of the other jaw."""
     exact = [k for k, end in enumerate(ORDER) if path.name == end]
     ending = [k for k, end in enumerate(ORDER) if path.name.endswith(end)]
-    return min(exact or ending or [len(ORDER)]), path.name
+    return min(exact or ending or [len(ORDER)]), path.name.replace("_lower", "_upper")
 
 
 def _copy(source: Path, target: Path) -> None:
