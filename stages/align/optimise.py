@@ -84,11 +84,13 @@ def optimise(
         The improved start and the mean weighted residual, relative to the distance.
     """
     used = [k for k, motion in enumerate(start.pair_from) if motion is not None]
-    if not used or options.iterations == 0:
+    if not used:
         return start, 0.0
     names = sorted(start.cameras)
     with threadpool_limits(limits=1):
         views, state = problem(pairs, start, used, names, options.samples)
+        if options.iterations == 0:
+            return start, _linearise(views, state, 1.0).mean
         if options.shared_focal and options.free_focals:
             state.focals[:] = common_focal(start, names)
         if not options.free_pairs:

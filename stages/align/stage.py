@@ -130,7 +130,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 8
+    version = 9
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")

@@ -193,8 +193,10 @@ def test_frames_of_pairs_can_be_freed(world):
 
 def test_no_iterations_or_no_pairs_change_nothing(world):
     pairs = stand_in(world)
-    start = start_from_tree(pairs)
-    assert optimise(pairs, start, AlignOptions(iterations=0)) == (start, 0.0)
+    start = start_from_cameras(pairs, disturbed(world[0], 1, 1.02))
+    kept, residual = optimise(pairs, start, AlignOptions(iterations=0))
+    assert kept is start
+    assert residual > 2 * optimise(pairs, start, AlignOptions())[1], "it is that of the start"
     nothing = Start({}, [None] * len(pairs))
     assert optimise(pairs, nothing, AlignOptions()) == (nothing, 0.0)
 
