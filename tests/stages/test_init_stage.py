@@ -88,7 +88,8 @@ def test_strangers_are_named_with_what_they_lack(tmp_path):
     assert sum(name in message for name in ("right.jpg", "front.jpg", "left.jpg")) >= 2
 
 
-def test_a_camera_that_only_turned_gives_no_scene(tmp_path):
+def test_a_camera_that_only_turned_gives_no_scene(tmp_path, monkeypatch):
+    monkeypatch.delattr("stages.init.sfm.solver.map_views")  # nobody looks for cameras
     base = texture(3, (300, 500))
     matrix = np.array([[400, 0, 128], [0, 400, 96], [0, 0, 1.0]])
     large = np.array([[400, 0, 250], [0, 400, 150], [0, 0, 1.0]])
@@ -96,7 +97,7 @@ def test_a_camera_that_only_turned_gives_no_scene(tmp_path):
     for angle in (-0.08, 0.0, 0.08):
         turn = cv2.Rodrigues(np.array([0, angle, 0.0]))[0]
         images.append(cv2.warpPerspective(base, matrix @ turn @ np.linalg.inv(large), (256, 192)))
-    with pytest.raises(ReconstructionError, match=r"turned on the spot|nearly the same spot"):
+    with pytest.raises(ReconstructionError, match="turned on the spot"):
         run(tmp_path, images)
 
 

@@ -143,6 +143,8 @@ def _failure(
             "The camera did not move between the photographs: they are the same, or nearly, "
             f"so that there is no depth to see. {HOW_TO_SHOOT}"
         )
+    if flat := _flat(evidence, limits):
+        return f"{flat} {HOW_TO_SHOOT}"
     if solution is None:
         return (
             "No two photographs could be placed against each other. "
@@ -168,12 +170,8 @@ def _failure(
 
 def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | None:
     """Why a reconstruction can't be believed, or None. Small residuals alone prove nothing."""
-    if evidence.flat > limits.max_flat:
-        return (
-            "The photographs show no depth: "
-            f"{100 * evidence.flat:.0f} % of what they share moves as if painted on a flat board. "
-            "The camera was turned on the spot, or what it saw is flat."
-        )
+    if flat := _flat(evidence, limits):
+        return flat
     angle = float(np.median(solution.triangulation_angles())) if len(solution.points) else 0.0
     centres = solution.centres()
     baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
@@ -198,6 +196,16 @@ def doubtful(solution: Solution, evidence: Evidence, limits: Limits) -> str | No
     if bare or not linked or (turned and np.median(turned) > limits.max_turn):
         return "The photographs could be placed only by coincidence: too few points agree on it."
     return None
+
+
+def _flat(evidence: Evidence, limits: Limits) -> str | None:
+    if evidence.flat <= limits.max_flat:
+        return None
+    return (
+        "The photographs show no depth: "
+        f"{100 * evidence.flat:.0f} % of what they share moves as if painted on a flat board. "
+        "The camera was turned on the spot, or what it saw is flat."
+    )
 
 
 def _turn(solution: Solution, pair: Pair, evidence: Evidence) -> float:

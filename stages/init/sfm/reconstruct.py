@@ -53,6 +53,8 @@ REFINEMENT = RefinementOptions()
 PAIRS_CHECKED_FOR_DEPTH = 4
 #: Pixels below which nothing moved between two photographs, and evidence that makes it certain.
 STILL, CERTAIN = 1.5, 25
+#: `Evidence.flat` from which on no cameras are looked for.
+FLAT = 0.98
 
 
 @dataclass(frozen=True)
@@ -78,17 +80,17 @@ class Evidence:
     flat: float = 0.0
     correspondences: Mapping[Pair, Correspondences] = field(default_factory=dict)
 
-    def is_still(self, pairs: Iterable[Pair] | None = None) -> bool:
-        """Does none of these pairs, all that are certain by default, show any movement?
+    def certain(self) -> list[Pair]:
+        """The pairs that are beyond doubt; none where these leave views out."""
+        found = [pair for pair, edge in self.edges.items() if edge.evidence >= CERTAIN]
+        linked = {view for pair in found for view in pair}
+        return found if len(linked) == len(self.keypoints) else []
 
-        False where that leaves views out.
-        """
-        certain = [pair for pair, edge in self.edges.items() if edge.evidence >= CERTAIN]
-        linked = {view for pair in certain for view in pair}
+    def is_still(self, pairs: Iterable[Pair] | None = None) -> bool:
+        """Does none of these pairs, all that are certain by default, show any movement?"""
+        certain = self.certain()
         asked = certain if pairs is None else pairs
-        return len(linked) == len(self.keypoints) > 0 and all(
-            self.displacement[pair] < STILL for pair in asked
-        )
+        return bool(certain) and all(self.displacement[pair] < STILL for pair in asked)
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,19 @@ def reconstruct(
         correspondences=correspondences,
     )
     unmoved = replace(evidence, edges=solver.first_edges(), linked=tuple(solver.links()))
-    if unmoved.is_still(correspondences):  # whatever the focal length, and however long one looks
+
+    def flatness(pairs: Iterable[Pair], edges: Mapping[Pair, TwoView]) -> float:
+        moving = sorted(pairs, key=lambda pair: (-evidence.displacement[pair], pair))
+        shares = [
+            homography_share(
+                correspondences[pair], edges[pair].inliers, options.max_error * pixel, seed
+            )
+            for pair in moving[:PAIRS_CHECKED_FOR_DEPTH]
+        ]
+        return min(shares, default=0.0)
+
+    unmoved = replace(unmoved, flat=flatness(unmoved.certain(), unmoved.edges))
+    if unmoved.is_still(correspondences) or unmoved.flat > FLAT:  # at whatever focal length
         return Attempt(None, unmoved, all(lens.focal for lens in lenses), focal_determined=False)
     free = options.refine_focal == "always" or (
         options.refine_focal == "auto"
@@ -211,20 +225,13 @@ def reconstruct(
     progress("reconstruct", 1, 1)
     edges = solver.edges_used(best)
     used = [pair for pair in best.edges if pair in edges] if best else []
-    used.sort(key=lambda pair: (-evidence.displacement[pair], pair))
-    shares = [
-        homography_share(
-            correspondences[pair], edges[pair].inliers, options.max_error * pixel, seed
-        )
-        for pair in used[:PAIRS_CHECKED_FOR_DEPTH]
-    ]
     return Attempt(
         solution=best,
         evidence=replace(
             evidence,
             edges=edges,
             linked=tuple(solver.believed(edges)),
-            flat=min(shares, default=0.0),
+            flat=flatness(used, edges),
         ),
         focal_known=known,
         focal_determined=determined,
