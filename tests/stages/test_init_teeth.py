@@ -13,7 +13,7 @@ from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
-from stages.init.dental.reconstruct import with_numbers
+from stages.init.dental.reconstruct import as_sentence, with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import (
@@ -263,3 +263,11 @@ def test_settings_reach_the_fit():
     with pytest.raises(RequestError, match="names 2 photographs"):
         place.arch_options(DentalConfig(order="right,left"), views)
     assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2
+
+
+def test_a_photograph_keeps_its_name_where_a_sentence_begins_with_it():
+    names = ["left.jpg", "right.jpg"]
+    assert as_sentence("right.jpg is odd.", names) == "right.jpg is odd."
+    assert (
+        as_sentence("crowns of left.jpg fit no tooth", names) == "Crowns of left.jpg fit no tooth."
+    )

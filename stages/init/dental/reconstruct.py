@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -161,7 +161,7 @@ def place_teeth(
     ]
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
-        shown = [f"{doubt[0].upper()}{doubt[1:].rstrip('.')}." for doubt in fit.doubts]
+        shown = [as_sentence(doubt, names) for doubt in fit.doubts]
         enough = " The front and one side are enough if the third does not belong." * (found == 3)
         raise ReconstructionError(
             f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
@@ -176,6 +176,12 @@ def place_teeth(
         for view, d in zip(views, numbered, strict=True)
     ]
     return PlacedTeeth(views, numbered, fit, turned, full)
+
+
+def as_sentence(doubt: str, names: Sequence[str]) -> str:
+    """A doubt as a sentence; the name of a photograph that it begins with stays as it is."""
+    begin = doubt[0] if doubt.startswith(tuple(names)) else doubt[0].upper()
+    return f"{begin}{doubt[1:].rstrip('.')}."
 
 
 def with_whole_crowns(
