@@ -18,7 +18,15 @@ from pipeline.untrusted.files import FILM, PHOTOGRAPH, UnusableFile, opened, rea
 from stages.views.reading.apart import Decoder
 from stages.views.reading.video import VideoFrame, Wanted, map_frames
 from stages.views.sheets import photographs_in
-from stages.views.working import Box, Mask, Prepared, UnusableMask, check_size, prepare
+from stages.views.working import (
+    Box,
+    Mask,
+    Prepared,
+    TooSmall,
+    UnusableMask,
+    check_size,
+    prepare,
+)
 
 Progress = Callable[[int, int], None]
 
@@ -85,6 +93,8 @@ def load_photos(
                 prepare(photo.rgb, photo.valid, photo.orientation, focal, long_side, mask, box)
                 for box in boxes
             ]
+        except TooSmall as error:
+            return TooSmall(f"{label} {error}", error.advice)
         except UnusableFile as error:
             return type(error)(f"{label} {error}")
         digest = hashlib.sha256(data).hexdigest()
@@ -160,6 +170,8 @@ def load_video(
         ]
     except UnusableMask as error:
         raise RequestError(f"The video {label} {error}. {MASK_ADVICE}") from error
+    except TooSmall as error:
+        raise RequestError(f"The video {label} {error}. {error.advice}") from error
     except UnusableFile as error:
         raise RequestError(
             f"The video {label} {error}. Check that it plays, save it again as MP4 (H.264), or "
@@ -270,4 +282,6 @@ def _refuse(problems: Sequence[UnusableFile], total: int) -> None:
     advice = f"Copy {them} again from the camera, or remove {them}, and run the same command."
     if all(isinstance(problem, UnusableMask) for problem in problems):
         advice = MASK_ADVICE
+    if small := [problem for problem in problems if isinstance(problem, TooSmall)]:
+        advice = f"{small[0].advice} {advice}"
     raise RequestError(f"{what} can't be used: {shown}. {advice}")

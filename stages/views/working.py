@@ -20,6 +20,18 @@ class UnusableMask(UnusableFile):
     """A photograph can't be used because of the mask that was given for it."""
 
 
+class TooSmall(UnusableFile):
+    """A photograph is too small.
+
+    Attributes:
+        advice: a sentence that goes for all that are.
+    """
+
+    def __init__(self, why: str, advice: str) -> None:
+        super().__init__(why)
+        self.advice = advice
+
+
 class Box(NamedTuple):
     """Rows top to bottom and columns left to right of a picture, the ends not among them."""
 
@@ -63,17 +75,18 @@ def working_size(width: int, height: int, long_side: int) -> tuple[int, int]:
 
 
 def check_size(width: int, height: int, long_side: int | None, min_side: int) -> None:
-    """Raise UnusableFile where the short side would come out below `min_side`.
+    """Raise TooSmall where the short side would come out below `min_side`.
 
     Args:
         long_side: of the result; None as it is stored.
     """
-    short = min(working_size(width, height, long_side or max(width, height)))
-    if short < min_side:
-        raise UnusableFile(
-            f"is {width} x {height} pixels: at the working size its short side would be "
-            f"{short} pixel{'s' if short > 1 else ''}, and {min_side} is the least "
-            "(views.min_side). Is it a scan line or a thumbnail?"
+    across, down = working_size(width, height, long_side or max(width, height))
+    if min(across, down) < min_side:
+        reduced = f", at the working size {across} x {down}" * ((across, down) != (width, height))
+        raise TooSmall(
+            f"is {width} x {height} pixels{reduced}",
+            f"The short side must have {min_side} pixels at least (views.min_side): scan lines "
+            "and thumbnails are no use.",
         )
 
 

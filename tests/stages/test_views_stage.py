@@ -208,6 +208,18 @@ def test_all_that_is_wrong_is_named_at_once(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "views").exists()
 
 
+def test_what_is_too_small_is_said_once(tmp_path: Path) -> None:
+    for n in range(3):
+        write(tmp_path / "in" / f"{n}.png", picture(n, 40, 30))
+    write(tmp_path / "in" / "row.png", picture(3, 2000, 100))
+    with pytest.raises(RequestError) as caught:
+        run_stage(tmp_path / "out", [tmp_path / "in"], long_side=512)
+    message = str(caught.value)
+    assert "0.png is 40 x 30 pixels; 1.png is 40 x 30 pixels; 2.png is 40 x 30 pixels; " in message
+    assert "row.png is 2000 x 100 pixels, at the working size 512 x 26. The short" in message
+    assert message.count("views.min_side") == 1
+
+
 def test_one_bad_file_and_one_bad_mask(tmp_path: Path) -> None:
     write(tmp_path / "in" / "a.png", picture(1))
     (tmp_path / "in" / "b.jpg").write_text("text")

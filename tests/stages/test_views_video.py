@@ -273,7 +273,9 @@ def test_broken_films(tmp_path: Path) -> None:
     short = film(tmp_path / "short.mp4", count=1)
     assert "short.mp4: one frame only" in refused(tmp_path / "c", short)
     narrow = film(tmp_path / "narrow.mp4", count=3, size=(640, 48))
-    assert "640 x 48" in refused(tmp_path / "d", narrow)
+    said = refused(tmp_path / "d", narrow)
+    assert "640 x 48" in said and "views.min_side" in said
+    assert "Check that it plays" not in said  # it does
     sound = tmp_path / "sound.mp4"
     with av.open(str(sound), "w") as container:
         stream: Any = container.add_stream("aac", rate=44100)
