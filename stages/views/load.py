@@ -44,6 +44,7 @@ class Loaded:
         picture: what it looks like.
         timestamp: seconds from the first frame of the video, or None.
         taken_at: by the camera's clock, seconds; or None.
+        pages: pictures in the file, of which the first is taken.
     """
 
     source_name: str
@@ -51,11 +52,13 @@ class Loaded:
     picture: Prepared
     timestamp: float | None = None
     taken_at: float | None = None
+    pages: int = 1
 
 
 def load_photos(
     files: Mapping[str, Path], masks: Mapping[str, Path], long_side: int, min_side: int,
     cut_sheets: bool = True, threads: int = 1, progress: Progress = lambda done, total: None,
+    warn: Callable[[str], None] = lambda message: None,
 ) -> list[Loaded]:  # fmt: skip
     """Load photographs.
 
@@ -67,6 +70,7 @@ def load_photos(
             are looked for where there is one file only.
         threads: how many to decode at a time; memory grows with it.
         progress: called with (done, total).
+        warn: called with what is not taken of a file that is used.
 
     Raises:
         RequestError: some can't be used; all of them are named.
@@ -99,19 +103,28 @@ def load_photos(
             return type(error)(f"{label} {error}")
         digest = hashlib.sha256(data).hexdigest()
         if len(pictures) == 1:
-            return [Loaded(label, digest, pictures[0], taken_at=photo.taken_at)]
-        return [Loaded(f"{label}#{k}", digest, picture) for k, picture in enumerate(pictures, 1)]
+            return [Loaded(label, digest, pictures[0], None, photo.taken_at, photo.pages)]
+        return [
+            Loaded(f"{label}#{k}", digest, picture, pages=photo.pages)
+            for k, picture in enumerate(pictures, 1)
+        ]
 
     loaded: list[Loaded] = []
     problems: list[UnusableFile] = []
     with Decoder() as decoder, ThreadPoolExecutor(max(1, min(threads, 4))) as pool:
         try:
-            for number, result in enumerate(pool.map(load, files), 1):
+            results = zip(files, pool.map(load, files), strict=True)
+            for number, (label, result) in enumerate(results, 1):
                 progress(number, len(files))
                 if isinstance(result, UnusableFile):
                     problems.append(result)
-                else:
-                    loaded += result
+                    continue
+                loaded += result
+                if result[0].pages > 1:
+                    warn(
+                        f"{label} has {result[0].pages} pages, of which the first is used. Save "
+                        "the others as files of their own, if they are wanted."
+                    )
         except BaseException:  # an interrupt does not wait for what is being decoded
             decoder.stop()
             pool.shutdown(wait=False, cancel_futures=True)

@@ -60,7 +60,7 @@ class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)
@@ -116,7 +116,7 @@ class ViewsStage(Stage):
         from_video = is_video(PurePath(first))
         wanted = (config.frames or FRAMES_OF_A_VIDEO) if from_video else len(files)
         frames = Wanted(wanted, config.sampling == "difference", _frame_numbers(first, config))
-        said: dict[str, None] = {}  # each once, however often the film is read
+        said: dict[str, None] = {}  # each once, however often the files are read
 
         def load(long_side: int) -> list[Loaded]:
             size = {"long_side": long_side, "min_side": config.min_side}
@@ -127,7 +127,7 @@ class ViewsStage(Stage):
                 )  # fmt: skip
             return load_photos(
                 files, masks, cut_sheets=config.cut_sheets,
-                threads=context.threads, progress=progress, **size,
+                threads=context.threads, progress=progress, warn=said.setdefault, **size,
             )  # fmt: skip
 
         if config.long_side == "auto":

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
@@ -174,6 +174,22 @@ def test_a_blank_picture_is_mentioned(tmp_path: Path) -> None:
     _, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
     assert len(context.warnings) == 1
     assert "black.png" in context.warnings[0]
+
+
+def test_further_pages_of_a_file_are_mentioned(tmp_path: Path) -> None:
+    first, second, third = (Image.fromarray(picture(n)) for n in range(3))
+    (tmp_path / "in").mkdir()
+    with TiffImagePlugin.AppendingTiffWriter(tmp_path / "in" / "a.tif", new=True) as file:
+        for page, kind in ((first, 0), (second, 0), (second.reduce(4), 1), (third, 0)):
+            page.save(file, format="TIFF", tiffinfo={254: kind})
+            file.newFrame()
+    write(tmp_path / "in" / "b.tif", picture(4))
+    views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
+    assert context.warnings == [
+        "a.tif has 3 pages, of which the first is used. Save the others as files of their own, if "
+        "they are wanted."
+    ]
+    np.testing.assert_allclose(views.views[0].image * 255, picture(0), atol=0.01)
 
 
 def test_two_identical_images(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +33,8 @@ Valid = npt.NDArray[np.bool_]
 LARGE = 60_000_000
 #: Pixels that are brought to sRGB at a time: what that takes is small beside the picture.
 STRIP = 1 << 20
+#: Of a TIFF file: the tag that says what a page is, its bits, and pages that are looked for.
+NEW_SUBFILE_TYPE, SMALLER, TRANSPARENCY, MOST_PAGES = 254, 1, 4, 1000
 #: What Pillow and its plugins raise on damaged files.
 DAMAGED = (
     OSError, SyntaxError, ValueError, RuntimeError, EOFError, LookupError, TypeError,
@@ -52,6 +54,7 @@ class Photo:
         orientation: EXIF orientation 1..8, still to be applied.
         focal_px: focal length in stored pixels, or None.
         taken_at: by the camera's clock, seconds; or None.
+        pages: pictures in the file, of which this is the first; smaller copies do not count.
     """
 
     rgb: Bytes
@@ -59,11 +62,13 @@ class Photo:
     orientation: int
     focal_px: float | None
     taken_at: float | None = None
+    pages: int = 1
 
     def facts(self) -> dict[str, Any]:
         """All but the pixels, by name."""
         return {
             "orientation": self.orientation, "focal_px": self.focal_px, "taken_at": self.taken_at,
+            "pages": self.pages,
         }  # fmt: skip
 
 
@@ -91,12 +96,24 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
                 image.load()
                 deep = header.bits == 16 and header.kind in ("PNG", "TIFF")
                 rgb, valid = _deep(data, header, image, profile) if deep else shown(image, profile)
+            pages = 1
             if header.kind == "TIFF":  # Pillow and OpenCV have turned it upright
+                pages = _pages(image)
                 rgb = make_stored(rgb, orientation)
                 valid = None if valid is None else make_stored(valid, orientation)
     except DAMAGED as error:
         raise UnusableFile(_describe_damage(error)) from error
-    return Photo(rgb, valid, orientation, focal, taken_at(details.get(DATE_TAKEN)))
+    return Photo(rgb, valid, orientation, focal, taken_at(details.get(DATE_TAKEN)), pages)
+
+
+def _pages(image: Any) -> int:
+    """Pictures in a TIFF file, its first page and those others that are no smaller copy or mask."""
+    found = 1
+    with suppress(*DAMAGED):  # of pages that are not used; and where they end
+        for page in range(1, MOST_PAGES):
+            image.seek(page)
+            found += not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & (SMALLER | TRANSPARENCY)
+    return found
 
 
 def decode_mask(data: bytes) -> npt.NDArray[np.bool_]:
