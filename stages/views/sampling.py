@@ -28,6 +28,23 @@ def uniform_indices(count: int, wanted: int | None) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, wanted).round()})
 
 
+def even_in_time(times: Sequence[int], wanted: int) -> list[int]:
+    """Choose `wanted` of frames that are shown at these times, rising, evenly in time.
+
+    The first and the last are among them, and none is taken twice.
+    """
+    count = len(times)
+    if wanted >= count:
+        return list(range(count))
+    aims = np.linspace(times[0], times[-1], wanted)
+    nearest = np.interp(aims, times, np.arange(count)).round()
+    chosen: list[int] = []
+    for k, frame in enumerate(nearest):  # as near as those before it and after it leave room for
+        least = chosen[-1] + 1 if chosen else 0
+        chosen.append(min(max(int(frame), least), count - wanted + k))
+    return chosen
+
+
 def is_sequence(names: Sequence[str]) -> bool:
     """Do the names say that the photographs were taken in this order, as frames of a film are?
 

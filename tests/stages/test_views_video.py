@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pipeline.stage import LocalContext
 from pipeline.untrusted.files import FILM, opened
 from stages.views.load import load_video
 from stages.views.reading.video import Wanted, map_frames
+from stages.views.sampling import even_in_time
 from stages.views.stage import ViewsConfig, ViewsStage
 from tests.films import read_frames
 
@@ -31,12 +33,13 @@ def level(index: int) -> int:
 
 def film(
     path: Path, count: int = 30, codec: str = "libx264", size: tuple[int, int] = (160, 96),
-    coded: str = "", bars: int = 0, pixel: Fraction | None = None, **container_options: str,
+    coded: str = "", bars: int = 0, pixel: Fraction | None = None,
+    ticks: Sequence[int] | None = None, **container_options: str,
 ) -> Path:  # fmt: skip
     """Write a film whose frame n is of brightness `level(n)`, red at the top left.
 
     `coded` are options of x264, `bars` the widths of black ones on the left and right, `pixel` is
-    the width of a pixel over its height.
+    the width of a pixel over its height, `ticks` say when frames are shown, in 25ths of a second.
     """
     with av.open(str(path), "w", options=container_options) as container:
         stream: Any = container.add_stream(codec, rate=Fraction(25))
@@ -54,7 +57,10 @@ def film(
                 blobs = np.random.default_rng(0).integers(0, 160, (12, 20, 3), np.uint8)
                 pixels += cv2.resize(blobs, size) // 2  # or all would be plain
                 pixels[:, :bars] = pixels[:, size[0] - bars :] = 0
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            if ticks is not None:
+                frame.pts, frame.time_base = ticks[index], Fraction(1, 25)
+            for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
@@ -82,6 +88,25 @@ def test_uniform_sampling(tmp_path: Path, codec: str, name: str) -> None:
     assert indices_by_brightness(frames) == [0, 10, 19, 29]
     np.testing.assert_allclose([f.seconds for f in frames], [0, 0.4, 0.76, 1.16], atol=1e-6)
     assert {frame.orientation for frame in frames} == {1}
+
+
+@pytest.mark.parametrize("coded", ["keyint=5:min-keyint=5", "keyint=5:intra-refresh=1"])
+@pytest.mark.parametrize("name", ["x.mp4", "x.mkv"])
+def test_frames_are_even_in_time_where_their_pace_changes(
+    tmp_path: Path, name: str, coded: str
+) -> None:
+    """As of phones, which take fewer frames where it is dark."""
+    slow = [2 * k for k in range(20)] + [40 + 8 * k for k in range(10)]
+    frames = read_frames(film(tmp_path / name, coded=coded, ticks=slow), 5)
+    times = [frame.seconds for frame in frames]
+    assert np.allclose(times, np.linspace(0, slow[-1] / 25, 5), atol=4 / 25 + 1e-3)
+    assert indices_by_brightness(frames) == [frame.index for frame in frames]
+
+
+def test_no_frame_is_taken_twice() -> None:
+    assert even_in_time([0, 1, 2, 3, 4, 100], 4) == [0, 3, 4, 5]
+    assert even_in_time([0, 96, 97, 98, 99, 100], 4) == [0, 1, 2, 5]
+    assert even_in_time([0, 1, 2], 3) == even_in_time([0, 1, 2], 5) == [0, 1, 2]
 
 
 def test_all_frames_of_a_short_film_and_any_thread_count(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ class Wanted:
 
     Attributes:
         count: how many, all if the film has fewer; the first and the last, or nearly, among them.
-        by_difference: spread evenly by how much they differ (`spread_indices`), or by number.
+        by_difference: spread evenly by how much they differ (`spread_indices`), or in time.
         also: numbers of frames that are taken as well, where the film has them.
         indices: numbers of the frames, rising, where these are known.
     """
@@ -117,7 +117,7 @@ def _chosen(
     child: Child, request: Mapping[str, Any], limit: float, count: int,
     progress: Callable[[int, int], None],
 ) -> list[int]:  # fmt: skip
-    """Numbers of so many frames; none where they are to be even by number."""
+    """Numbers of so many frames; none where they are to be even in time."""
     for at in ("keys", "all"):
         places: list[int] = []
         pictures: list[npt.NDArray[np.uint8]] = []

@@ -6,7 +6,7 @@ import importlib
 import os
 import pkgutil
 from bisect import bisect_left, bisect_right
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
@@ -16,7 +16,7 @@ from pipeline.untrusted.child import Arrays, Reply, Values
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.films import MAX_PIXELS, opened_film
 from stages.views.reading.shown import shown, shown_size, turn_of
-from stages.views.sampling import uniform_indices
+from stages.views.sampling import even_in_time, uniform_indices
 
 #: Readers of films that hold an index of their frames.
 WITH_INDEX = ("mov", "matroska")
@@ -46,8 +46,8 @@ class _Contents:
 
 
 def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
-    """Frames of the film behind an open descriptor: these ``indices``, or ``wanted`` uniform ones,
-    and ``also`` others.
+    """Frames of the film behind an open descriptor: these ``indices``, or ``wanted`` ones that are
+    even in time (where the packets don't tell it, by number), and ``also`` others.
 
     The packets are counted first. Then each frame is decoded from the key frame before it, or,
     where packets don't tell these, the whole film once. If the film is not as its packets say
@@ -69,11 +69,12 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
                     yield from _glance(file, wanted, contents, threads, by_keys)
                 return
             if contents.keys:
-                indices = _indices(values, count)
+                indices = _indices(values, count, contents.shown)
                 if (yield from _decode_from_keys(file, indices, contents, threads)):
                     return
                 yield {"again": True}, []
-            found = yield from _decode(file, _indices(values, count), count, threads)
+            indices = _indices(values, count, contents.shown)
+            found = yield from _decode(file, indices, count, threads)
             if found not in (0, count):
                 yield {"again": True}, []
                 yield from _decode(file, _indices(values, found), found, threads)
@@ -84,10 +85,11 @@ def work(values: Values, arrays: Arrays) -> Iterator[Reply]:
             raise UnusableFile(f"can't be read as a video ({reason})") from error
 
 
-def _indices(values: Values, count: int) -> list[int]:
-    """Numbers of the frames to take of a film that has so many."""
-    given = [int(index) for index in values["indices"]]
-    spread = given if given and given[-1] < count else uniform_indices(count, int(values["wanted"]))
+def _indices(values: Values, count: int, shown: Sequence[int] = ()) -> list[int]:
+    """Numbers of the frames to take of a film that has so many, which are shown then."""
+    given, wanted = [int(index) for index in values["indices"]], int(values["wanted"])
+    even = even_in_time(shown, wanted) if shown else uniform_indices(count, wanted)
+    spread = given if given and given[-1] < count else even
     return sorted({*spread, *(index for index in values["also"] if 0 <= index < count)})
 
 
