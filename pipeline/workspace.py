@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from pipeline.config import Config, RunConfig, anchored, load_config, yaml_value
@@ -51,6 +52,12 @@ class Request:
         before = {change.removeprefix("--set ") for change in self.taken_over}
         return frozenset(c.partition("=")[0].strip() for c in self.overrides if c not in before)
 
+    @property
+    def typed_before(self) -> str:
+        """What is the last run's, as one types it."""
+        options = (option.partition(" ") for option in self.taken_over)
+        return " ".join(f"{name} {quote(value)}" for name, _, value in options)
+
     def save(self) -> None:
         """Remember the request in the workspace, for `status` and for runs that name no images."""
         entry: dict[str, Any] = {
@@ -87,8 +94,8 @@ def read_request(folder: Path) -> dict[str, Any]:
     except DamagedError as error:
         raise RequestError(
             f"{folder / REQUEST} is damaged ({error}): what this workspace was made from is not "
-            f"known any more. Name the photographs and settings once more: pipeline run "
-            f"PHOTOGRAPHS -w {folder}. What was computed is kept and used again."
+            "known any more. What was computed is kept and used again. Name the photographs and "
+            f"settings once more: pipeline run PHOTOGRAPHS -w {quote(str(folder))}"
         ) from error
     if found is None:
         raise RequestError(
@@ -196,7 +203,7 @@ def config_of(request: Request) -> Config:
         if not request.taken_over or _can_be_read(request.preset, before):
             raise
         raise RequestError(
-            f"{request.workspace} was run with {' '.join(request.taken_over)} last, which can't be "
+            f"{request.workspace} was run with {request.typed_before} last, which can't be "
             f"used any more. {error} To start from the defaults instead, add -c dentalsplat."
         ) from error
 

@@ -70,7 +70,7 @@ def run(
     reporter = reporter or Reporter()
     if request.taken_over:
         reporter.message(
-            f"As in the last run of this workspace: {' '.join(request.taken_over)} "
+            f"As in the last run of this workspace: {request.typed_before} "
             "(-c dentalsplat starts from the defaults instead)."
         )
     if request.left_out:

@@ -183,6 +183,12 @@ def test_paths_of_a_preset_begin_at_its_folder(tmp_path: Path) -> None:
     assert (sections["init"].cameras, sections["fit"].iterations) == ("~/c", 5)
 
 
+def test_what_a_last_run_had_is_said_as_a_shell_takes_it(tmp_path: Path) -> None:
+    make_request("photos", tmp_path, "paper", ["views.masks=/of me/m", "fit.iterations=5"]).save()
+    request = make_request(workspace=tmp_path, as_before=True)
+    assert request.typed_before == "-c paper --set 'views.masks=/of me/m' --set fit.iterations=5"
+
+
 def test_one_stage_or_setting_may_be_given_as_it_is(tmp_path: Path) -> None:
     """Strings are sequences of strings, too: stages='views' was the stages v, i, e, w and s."""
     request = make_request((), tmp_path, None, "fit.iterations=5", "views, init")

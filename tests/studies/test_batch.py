@@ -306,9 +306,11 @@ def test_wrong_requests_are_refused_before_anything_is_written(run: Any, tmp_pat
     from filelock import FileLock
 
     case = add_case(tmp_path, "a", 1, 2)
+    add_case(tmp_path, "a b", 1, 2)
     for change, text in (
         ({"cases": "case"}, "Did you mean 'cases'"),
-        ({"cases": "cases/a"}, "is one case: pipeline run"),
+        ({"cases": "cases/a"}, r"is one case.*pipeline run /\S*/cases/a$"),
+        ({"cases": "cases/a b"}, r"pipeline run '/\S*/cases/a b'$"),
         ({"overrides": ["fit.fial=1"]}, r"fit\.fail"),
         ({"scheduler": "nowhere.json"}, "neither an address"),
         ({"scheduler": str(case / "1.jpg")}, "names no address"),

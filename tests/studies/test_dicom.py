@@ -243,6 +243,7 @@ def result_of(folder: Path, stage: str) -> Result:
 
 
 def test_exports_are_those_that_the_last_request_leads_to(tmp_path: Path) -> None:
+    tmp_path /= "a b"
     fit, export = scene(tmp_path)
     place = export.result and export.result.folder / "exports"
 
@@ -252,8 +253,11 @@ def test_exports_are_those_that_the_last_request_leads_to(tmp_path: Path) -> Non
     assert found(fit, export) == place
     stopped = replace(fit, state="stale", reasons=("fit.iterations 5 → 9",))
     waiting = replace(export, state="pending")
-    with pytest.raises(RequestError, match=r"'fit' has yet to run \(fit.iterations 5 → 9\)"):
+    with pytest.raises(
+        RequestError, match=r"'fit' has yet to run \(fit.iterations 5 → 9\)"
+    ) as said:
         found(stopped, waiting)
+    assert str(said.value).endswith(f"pipeline run -w '{tmp_path}'"), "as a shell takes it"
     newer = ("library numba 1 → 2", "fit version 3 → 4", "fit.speed (absent) → 1")
     assert found(replace(fit, state="stale", reasons=newer), waiting) == place
     assert found(fit) == place, "a request that ends before the exports, of the fit that they show"

@@ -163,10 +163,10 @@ def test_a_run_without_a_scale_is_as_large_as_textbook_teeth(tmp_path: Path) -> 
 
 
 def test_an_unfinished_run_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
-    half = tmp_path / "half"
+    half = tmp_path / "half of it"
     half.mkdir()
     (half / "request.json").write_text((workspaces[0] / "request.json").read_text())
-    with pytest.raises(RequestError, match="finish the run first"):
+    with pytest.raises(RequestError, match=rf"run first \(pipeline run -w '{half}'\)"):
         run_register(half, workspaces[1])
 
 

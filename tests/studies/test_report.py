@@ -87,6 +87,15 @@ def test_what_a_person_left_out_is_not_called_unplaced(tmp_path: Path) -> None:
     assert "All 2 photographs were placed in space. Left out by hand: right.jpg." in text
 
 
+def test_the_command_is_written_as_a_shell_takes_it(tmp_path: Path) -> None:
+    workspace = case.write_case(tmp_path / "w", ("views",))
+    asked = json.loads((workspace / "request.json").read_text())
+    asked |= {"images": ["/of/my photos"], "overrides": ["views.held_out=[a.jpg, b.jpg]"]}
+    (workspace / "request.json").write_text(json.dumps(asked))
+    text = text_of(run_report(workspace).read_text())
+    assert "pipeline run 'my photos' --stages views --set 'views.held_out=[a.jpg, b.jpg]'" in text
+
+
 def test_names_and_warnings_are_text_and_not_markup(tmp_path: Path) -> None:
     workspace = case.write_case(tmp_path / "<i>case&", unplaced=True)
     page = run_report(workspace).read_text()

@@ -10,6 +10,7 @@ import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 from pipeline.errors import RequestError
 from pipeline.files import sha256_file
@@ -83,8 +84,8 @@ def find_cases(place: Path, names: Names) -> list[Case]:
     kinds = [kind for _, kind in entries]
     if "folder" not in kinds and "picture" in kinds:
         raise RequestError(
-            f"{place} holds photographs itself, so it is one case: pipeline run {place}. A batch "
-            "is given the folder that holds a folder for each case."
+            f"{place} holds photographs itself, so it is one case. A batch is given the folder "
+            f"that holds a folder for each case. To run this one: pipeline run {quote(str(place))}"
         )
     from stages.views.sampling import natural_key
 

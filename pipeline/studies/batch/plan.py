@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from pipeline.errors import RequestError, nearest
@@ -130,7 +131,8 @@ def check_folder(out: Path, place: Path, cases: Sequence[Case], *, chosen: bool)
     if not chosen:
         raise RequestError(
             f"{out} holds the results of other cases, those of {before}. Choose another folder for "
-            f"the cases of {place}: -o. If they are the same cases, name this one: -o {out}."
+            f"the cases of {place}: -o. If they are the same cases, name this one: "
+            f"-o {quote(str(out))}"
         )
     for case in cases:
         record = read_case(out, case.id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from shlex import quote
 
 from pipeline.errors import RequestError
 from pipeline.pages.case import Case, StageRecord
@@ -30,7 +31,8 @@ def exports_of(case: Case) -> Path:
     if case.failed is not None and case.failed.name not in later:
         raise RequestError(
             f"{case.workspace}: the last run ended in {case.failed.name}, and exports that are "
-            f"there belong to a run before. 'pipeline status -w {case.workspace}' says why."
+            f"there belong to a run before. What says why: "
+            f"pipeline status -w {quote(str(case.workspace))}"
         )
     for entry in case.stages:
         if entry.name not in later and entry.state in ("stale", "missing") and not _aged(entry):
@@ -48,7 +50,7 @@ def exports_of(case: Case) -> Path:
 def _unfinished(workspace: Path, why: str) -> str:
     return (
         f"{workspace} has no exports of what it was last asked for: {why}. Run the pipeline to its "
-        f"end first: pipeline run -w {workspace}."
+        f"end first: pipeline run -w {quote(str(workspace))}"
     )
 
 

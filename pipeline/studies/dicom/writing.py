@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Iterable
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,7 @@ def write_all(
     if not isinstance(scene, dict):
         raise RequestError(
             f"{workspace} has no exports to write as DICOM files. Run the pipeline to its end "
-            f"first: pipeline run -w {workspace}."
+            f"first: pipeline run -w {quote(str(workspace))}"
         )
     scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
     solids, left_out = _solids(results, scale, scene.get("frame", {}), unscaled)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 
 import cv2
 import numpy as np
@@ -148,7 +149,7 @@ def read_visit(workspace: Path) -> Visit:
     if case.failed is not None:
         raise RequestError(
             f"{workspace}: the run ended in {case.failed.name} and has no scene to compare. "
-            f"'pipeline status -w {workspace}' says why."
+            f"What says why: pipeline status -w {quote(str(workspace))}"
         )
     views, cameras, gaussians, teeth = (
         case.latest(kind) for kind in ("views", "cameras", "gaussians", "teeth")
@@ -157,7 +158,7 @@ def read_visit(workspace: Path) -> Visit:
         if made is None:
             raise RequestError(
                 f"{workspace} holds no result of the stage '{stage}': finish the run first "
-                f"(pipeline run -w {workspace})."
+                f"(pipeline run -w {quote(str(workspace))})."
             )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()

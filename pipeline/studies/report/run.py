@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -209,12 +210,14 @@ def command(case: Case) -> str:
     images = [Path(path).name for path in request.get("images", [])]
     if len(images) > MOST_NAMED:
         images = [images[0], "...", images[-1]]
-    parts = ["pipeline run", *images]
+    parts = ["pipeline", "run", *images]
     if request.get("preset"):
-        parts.append(f"-c {Path(request['preset']).name}")
+        parts += ["-c", Path(request["preset"]).name]
     if request.get("stages"):
-        parts.append(f"--stages {','.join(request['stages'])}")
+        parts += ["--stages", ",".join(request["stages"])]
     if request.get("from"):
-        parts.append(f"--from {request['from']}")
-    parts += [f"--set {text}" for text in request.get("overrides", [])]
-    return str(case.hide(" ".join(parts)))
+        parts += ["--from", request["from"]]
+    for text in request.get("overrides", []):
+        parts += ["--set", text]
+    # without names it can't be run, and quotes could keep a name from being known
+    return str(case.hide(" ".join(parts))) if case.nameless else shlex.join(parts)
