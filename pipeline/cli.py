@@ -263,35 +263,6 @@ def warmup_command() -> None:
 register_studies(app)
 
 
-@app.command("register")
-def register_command(
-    first: Annotated[Path, typer.Argument(metavar="A", help="Workspace of the first visit.")],
-    second: Annotated[Path, typer.Argument(metavar="B", help="Workspace of the second visit.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Folder of the results.  [default: B/register]"),
-    ] = None,
-    live: Annotated[
-        bool,
-        typer.Option(
-            help="Both scenes to turn on the page, or only pictures of them: a small page."
-        ),
-    ] = True,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Two visits of one patient in one frame: which teeth moved, how far and which way."""
-    from pipeline.front.progress import make_reporter
-    from pipeline.studies.register import run_register
-
-    page, said = run_register(
-        first, second, out, live=live, reporter=make_reporter(quiet=quiet, verbose=verbose)
-    )
-    if not quiet:
-        size = page.stat().st_size / 1e6
-        print(f"{said}\n\nLook at it: open {page} ({size:.1f} MB) in a browser.")
-
-
 @app.command("clean")
 def clean_command(
     workspace: Workspace = None,

@@ -122,6 +122,8 @@ def make_request(
             last run; those given now come on top. A preset that is named starts from that.
     """
     given = [images] if isinstance(images, str | Path) else list(images)
+    if "" in given:
+        raise RequestError("The name of a photograph or folder is empty; this folder is '.'.")
     if workspace is None:
         workspace = default_workspace(given)
     folder = Path(workspace)

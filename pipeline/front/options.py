@@ -15,6 +15,18 @@ from pipeline.process.privacy import SHARES, Share
 
 Word = TypeVar("Word", bound=str)
 
+
+def path(text: str) -> Path:
+    """A path, which is not empty: pathlib takes that for the current folder.
+
+    Raises:
+        RequestError: it is, as where a variable of the shell is not set.
+    """
+    if not text:
+        raise RequestError("A path that was given is empty. The current folder is called '.'.")
+    return Path(text)
+
+
 Images = Annotated[
     list[str] | None,
     typer.Argument(
@@ -23,7 +35,9 @@ Images = Annotated[
 ]
 Workspace = Annotated[
     Path | None,
-    typer.Option("-w", "--workspace", help="Where results are kept.  [default: ./runs/<input>]"),
+    typer.Option(
+        "-w", "--workspace", parser=path, help="Where results are kept.  [default: ./runs/<input>]"
+    ),
 ]
 Preset = Annotated[
     str | None,

@@ -1,4 +1,4 @@
-"""The commands that do something with whole runs: compare, benchmark, batch, dicom."""
+"""The commands that do something with whole runs: compare, benchmark, batch, dicom, register."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from pipeline.front.options import (
     answer,
     one_of,
     only_workspace,
+    path,
     sharing,
 )
 
@@ -29,7 +30,9 @@ def compare_command(
     workspace: Workspace = None,
     colmap: Annotated[
         Path | None,
-        typer.Option("--colmap", help="Folder of a COLMAP model of the same photographs."),
+        typer.Option(
+            "--colmap", parser=path, help="Folder of a COLMAP model of the same photographs."
+        ),
     ] = None,
     run_colmap: Annotated[
         bool, typer.Option("--run-colmap", help="Run COLMAP here, with two settings.")
@@ -38,6 +41,7 @@ def compare_command(
         Path | None,
         typer.Option(
             "--ground-truth",
+            parser=path,
             help="True cameras: transforms.json or a COLMAP model; default: what the run was "
             "evaluated with.",
         ),
@@ -45,7 +49,9 @@ def compare_command(
     mesh: Annotated[
         Path | None,
         typer.Option(
-            "--mesh", help="True surface, in the frame of --ground-truth; default: evaluate.mesh."
+            "--mesh",
+            parser=path,
+            help="True surface, in the frame of --ground-truth; default: evaluate.mesh.",
         ),
     ] = None,
     fit: Annotated[
@@ -85,12 +91,17 @@ def benchmark_command(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="Folder of the results.  [default: ./runs/benchmark_SUITE]"
+            "-o",
+            "--out",
+            parser=path,
+            help="Folder of the results.  [default: ./runs/benchmark_SUITE]",
         ),
     ] = None,
     data: Annotated[
         Path | None,
-        typer.Option("--data", help="Where the suite's data are, if not where it says."),
+        typer.Option(
+            "--data", parser=path, help="Where the suite's data are, if not where it says."
+        ),
     ] = None,
     jobs: Annotated[
         int, typer.Option("--jobs", min=1, help="Workspaces at a time; they share the cores.")
@@ -129,13 +140,16 @@ def batch_command(
         Path,
         typer.Argument(
             metavar="CASES",
+            parser=path,
             help="A folder that holds a folder of photographs (or one film) for each case, or a "
             "CSV file with the columns name, photographs, settings.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Folder of the results.  [default: ./runs/batch_CASES]"),
+        typer.Option(
+            "-o", "--out", parser=path, help="Folder of the results.  [default: ./runs/batch_CASES]"
+        ),
     ] = None,
     jobs: Annotated[
         int, typer.Option("--jobs", min=1, help="Cases at a time here; they share the cores.")
@@ -205,7 +219,9 @@ def dicom_command(
     workspace: Workspace = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Folder of the files.  [default: WORKSPACE/dicom]"),
+        typer.Option(
+            "-o", "--out", parser=path, help="Folder of the files.  [default: WORKSPACE/dicom]"
+        ),
     ] = None,
     patient_id: Annotated[str | None, typer.Option("--patient-id", help="PatientID.")] = None,
     patient_name: Annotated[
@@ -261,9 +277,44 @@ def dicom_command(
         raise typer.Exit(1)
 
 
+def register_command(
+    first: Annotated[
+        Path, typer.Argument(metavar="A", parser=path, help="Workspace of the first visit.")
+    ],
+    second: Annotated[
+        Path, typer.Argument(metavar="B", parser=path, help="Workspace of the second visit.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", parser=path, help="Folder of the results.  [default: B/register]"
+        ),
+    ] = None,
+    live: Annotated[
+        bool,
+        typer.Option(
+            help="Both scenes to turn on the page, or only pictures of them: a small page."
+        ),
+    ] = True,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Two visits of one patient in one frame: which teeth moved, how far and which way."""
+    from pipeline.front.progress import make_reporter
+    from pipeline.studies.register import run_register
+
+    page, said = run_register(
+        first, second, out, live=live, reporter=make_reporter(quiet=quiet, verbose=verbose)
+    )
+    if not quiet:
+        size = page.stat().st_size / 1e6
+        print(f"{said}\n\nLook at it: open {page} ({size:.1f} MB) in a browser.")
+
+
 def register_studies(app: typer.Typer) -> None:
     """Make these commands part of the command line."""
     app.command("compare")(compare_command)
     app.command("benchmark")(benchmark_command)
     app.command("batch")(batch_command)
     app.command("dicom")(dicom_command)
+    app.command("register")(register_command)

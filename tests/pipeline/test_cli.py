@@ -89,6 +89,9 @@ def test_status_tells_why(toys: Path) -> None:
         ((*RUN, "--nonsense"), 2, "nonsense"),
         (("run",), 2, "Give the photographs"),
         (("status",), 2, "Say which workspace"),
+        (("run", "images", "-w", "", "-c", "toy.yaml"), 2, "A path that was given is empty"),
+        (("clean", "-w", ""), 2, "A path that was given is empty"),
+        (("run", "", "-w", "w", "-c", "toy.yaml"), 2, "photograph or folder is empty"),
         (("frobnicate",), 2, "frobnicate"),
     ],
 )
