@@ -21,7 +21,7 @@ COPY configs configs
 # Bytecode is made here: later nobody may write beside the program. Open3D without CUDA is a third.
 RUN pip install --no-cache-dir --compile --constraint constraints.txt '.[batch,dicom]' \
     && pip uninstall --yes open3d \
-    && pip install --no-cache-dir --compile open3d-cpu \
+    && pip install --no-cache-dir --compile --constraint constraints.txt open3d-cpu \
     && rm -rf /src
 
 # The kernels, compiled beside the program, where every user may read them. They are for the kind of
