@@ -24,7 +24,8 @@ browsers: system chromium .venv/installed-dev
 	@tools/system-packages browsers
 	for engine in firefox webkit; do \
 	    PAGES_IN=$$engine xvfb-run -a -s "-screen 0 1600x1200x24" $(BIN)/python -m pytest \
-	        tests/stages/test_viewer_tools.py tests/studies/test_register_command.py || exit 1; \
+	        tests/stages/test_viewer_tools.py tests/stages/test_viewer_steering.py \
+	        tests/stages/test_viewer_marks.py tests/studies/test_register_command.py || exit 1; \
 	done
 
 # The recipes for SLURM and Kubernetes of docs/batch.md, run as far as one machine can.
