@@ -120,6 +120,41 @@ def test_what_is_drawn_is_of_what_is_there(tmp_path: Path) -> None:
     assert found["crosshair"] == [True, False, True], "it is there while the keys are the scene's"
 
 
+UNSURE = """(async () => {
+  await page.ready;
+  const { rotation, translation, fx, fy, cx, cy, width, height } = page.views[0];
+  const matrix = [0, 1, 2].flatMap((k) => [...rotation.slice(3 * k, 3 * k + 3), translation[k]]);
+  const picked = (zoom, fine, [x, y]) => {
+    page.setCamera(matrix, zoom * fx, zoom * fy, fine * width / 2 - zoom * (width / 2 - cx),
+      fine * height / 2 - zoom * (height / 2 - cy), fine * width, fine * height);
+    page.render();
+    return page.pick(fine * width / 2 + zoom * (x - width / 2),
+      fine * height / 2 + zoom * (y - height / 2));
+  };
+  let alone = null;
+  for (let x = 0; x < width && !alone; x += 2) {
+    if (picked(1, 1, [x + .5, 60.5])?.seen === 1) alone = [x + 3.5, 60.5];
+  }
+  const told = (place) => [place.across, place.along, place.seen];
+  tell({ once: told(picked(1, 1, alone)), finer: told(picked(2, 2, alone)),
+    nearer: told(picked(1.5, 1, alone)), page: canvas.clientWidth / width,
+    errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_how_sure_a_place_is_does_not_hang_on_the_pixels_of_the_canvas(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(), HEAD + UNSURE, tmp_path, (640, 480), address="#still")
+    assert (found["errors"], log) == ("", [])
+    (across, along, seen), finer, nearer = found["once"], found["finer"], found["nearer"]
+    assert seen == finer[2] == nearer[2] == 1
+    assert np.allclose(across, 1.5 / found["page"] * 3.5 / 200, rtol=0.2), "1.5 of the page"
+    assert np.allclose(finer[0], across, rtol=0.02), "a screen with more pixels points no better"
+    assert np.allclose(nearer[0], across / 1.5, rtol=0.02), "enlarged, one points better"
+    assert np.allclose(along, 20 * 3.5 / 200, rtol=0.2), "20 pixels of the one photograph"
+    assert np.allclose([finer[1], nearer[1]], along, rtol=0.02), "its depth stays as unsure"
+
+
 SAVED = """(async () => {
   await page.ready;
   let blob = null;

@@ -116,15 +116,27 @@ function covered(splats, pose, points, margin, shown) {
  * @property {number} jaw 0 neither, 1 upper, 2 lower
  */
 
-/** Pointing is good to so many pixels, and a single photograph's depth to this share of a pixel. */
+/**
+ * Pointing is good to so many pixels of the page, whatever the canvas has, and the depth of a
+ * single photograph to this share of a pixel of its own, whatever the page shows.
+ */
 const POINTING = 1.5, LEAST_PARALLAX = 0.05;
+
+/** How long a pixel of the photographs is at a place: the median of all. */
+function photoPixel(views, point) {
+  const lengths = views.map(({ rotation, translation, fx }) =>
+    (dot(rotation.slice(6, 9), point) + translation[2]) / fx).sort((a, b) => a - b);
+  return Math.max(0, lengths[lengths.length >> 1]);
+}
 
 /**
  * The place under a pixel, or null where the scene is more transparent than not.
- * @param {Pose} pose whose size is in the pixels of x, y
+ * @param {object} scene as the page holds it
+ * @param {{pose: Pose, x: number, y: number, fine: number}} spot the size of the pose is in the
+ *   pixels of x, y, of which there are so many to one of the page
  * @returns {?Place}
  */
-function pick(splats, format, pose, x, y, shown) {
+function pick(splats, { format, views }, { pose, x, y, fine }, shown) {
   let light = 1, sum = 0, squares = 0;
   const seen = new Map(), jaws = [0, 0, 0];
   for (const { z, alpha, splat } of layersAt(splats, format, pose, x, y, shown)) {
@@ -144,12 +156,13 @@ function pick(splats, format, pose, x, y, shown) {
   const ray = [(x - pose.cx) / pose.fx, (y - pose.cy) / pose.fy, 1];
   const turn = transposed(pose.rotation);
   const most = [...seen].reduce((best, entry) => (entry[1] > best[1] ? entry : best), [0, -1])[0];
-  const pixel = z / pose.fx;
+  const point = applied(turn, minus(scaled(ray, z), pose.translation));
+  const alone = most < 2 && format.knowsSeen ? photoPixel(views, point) / LEAST_PARALLAX : 0;
   return {
-    point: applied(turn, minus(scaled(ray, z), pose.translation)),
+    point,
     ray: unit(applied(turn, ray)),
-    across: POINTING * pixel,
-    along: most < 2 && format.knowsSeen ? Math.max(spread, pixel / LEAST_PARALLAX) : spread,
+    across: POINTING * fine * z / pose.fx,
+    along: Math.max(spread, alone),
     seen: most,
     jaw: jaws.indexOf(Math.max(...jaws)),
   };

@@ -55,8 +55,11 @@ function hookOf(viewer) {
       viewer.backdrop = rgb;
       viewer.wake(false);
     },
-    pick: (x, y) => pick(
-      viewer.splats, viewer.scene.format, viewer.panes()[0].pose, x, y, viewer.shownParts()),
+    pick(x, y) {
+      const [{ pose }] = viewer.panes();
+      const fine = viewer.canvas.width / viewer.canvas.clientWidth;
+      return pick(viewer.splats, viewer.scene, { pose, x, y, fine }, viewer.shownParts());
+    },
     render: () => viewer.render(),
     pixels() {
       viewer.render();

@@ -129,7 +129,7 @@ class Tools {
     }
     const spot = this.viewer.paneAt(x, y);
     const { splats, scene } = this.viewer;
-    const place = pick(splats, scene.format, spot.pose, spot.x, spot.y, this.viewer.shownParts());
+    const place = pick(splats, scene, spot, this.viewer.shownParts());
     if (!place) {
       this.tell("There is no surface at this point.");
       return;

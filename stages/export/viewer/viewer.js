@@ -122,14 +122,14 @@ class Viewer extends Screen {
     };
   }
 
-  /** The pane and its pixel under a place on the page. */
+  /** The pane and its pixel under a place on the page, and how many make one of the page. */
   paneAt(x, y) {
     const panes = this.panes();
     const box = this.canvas.getBoundingClientRect();
     const scale = this.canvas.width / box.width;
     const pixel = [(x - box.left) * scale, (y - box.top) * scale];
     const { pose, left } = panes[panes.length > 1 && pixel[0] >= panes[1].left ? 1 : 0];
-    return { pose, x: pixel[0] - left, y: pixel[1] };
+    return { pose, x: pixel[0] - left, y: pixel[1], fine: scale };
   }
 
   /** The middle of the free part of the first pane, in pixels of the page. */
