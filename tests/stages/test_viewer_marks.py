@@ -120,6 +120,45 @@ def test_what_is_drawn_is_of_what_is_there(tmp_path: Path) -> None:
     assert found["crosshair"] == [True, False, True], "it is there while the keys are the scene's"
 
 
+ELSEWHERE = """(async () => {
+  await page.ready;
+  const wait = () => new Promise((done) => setTimeout(done, 300));
+  const go = async (hash) => { location.hash = hash; await wait(); };
+  const warned = () => [!$("elsewhere").hidden, !$("told").hidden, page.state.marks.length];
+  const result = { opened: warned(), said: said() };
+  press("l");
+  await wait();
+  const theirs = location.hash;
+  await go("view=1");
+  result.stays = warned().filter((_, k) => k !== 1);
+  await go("n=0,0,-1,0,0,1,.01,.01,3&text=ours");
+  result.unsaid = warned()[0];
+  press("l");
+  await wait();
+  const ours = location.hash;
+  await go(theirs);
+  result.theirs = warned()[0];
+  await go(ours);
+  result.ours = warned()[0];
+  tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
+})();"""
+
+
+@needs_chromium
+def test_a_link_of_another_scene_is_followed_and_said(tmp_path: Path) -> None:
+    camera = "camera=1,0,0,0,1,0,0,0,1,0,0,0,4,0"
+    note = "n=0,0,-1,0,0,1,.01,.01,3&text=theirs"
+    found, log = run_in(
+        ball_page(), HEAD + ELSEWHERE, tmp_path, (640, 480),
+        address=f"#still&scene=<b>another&{camera}&{note}", coarse=True,
+    )  # fmt: skip
+    assert (found["errors"], log) == ("", [])
+    assert found["opened"] == [True, True, 1]
+    assert found["said"].strip().startswith("This link was made in another scene")
+    assert found["stays"] == [True, 1], "the marks are still the other scene's"
+    assert (found["unsaid"], found["theirs"], found["ours"]) == (False, True, False)
+
+
 UNSURE = """(async () => {
   await page.ready;
   const { rotation, translation, fx, fy, cx, cy, width, height } = page.views[0];

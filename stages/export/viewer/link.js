@@ -40,9 +40,9 @@ function placeText({ point, ray, across, along, seen }) {
   return [...point, ...ray, across, along, seen].map(brief).join(",");
 }
 
-/** The state and the camera as the part of an address after the `#`. */
-function linkOf(state, camera, lens) {
-  const link = new URLSearchParams();
+/** The state and the camera as the part of an address after the `#`; and of which scene they are. */
+function linkOf(state, camera, lens, scene) {
+  const link = new URLSearchParams({ scene });
   const numbers = [...camera.rotation, ...camera.target, camera.distance, lens];
   link.set("camera", numbers.map(brief).join(","));
   for (const key of ["numbers", "jaw"]) {
@@ -114,10 +114,11 @@ function cameraIn(text, limits, lenses) {
 /**
  * What an address asks for. Whatever in it is not as `linkOf` writes it is left out.
  * @param {string} hash @param {object} orbiting of the scene @param {number} lenses how many views
- * @returns {{state: object, camera: ?object}}
+ * @returns {{state: object, camera: ?object, scene: ?string}} and of which scene it is; null where
+ *   it does not say so, as of one that is written by hand
  */
 function readLink(hash, orbiting, lenses) {
-  if (hash.length > LONGEST_LINK) return { state: {}, camera: null };
+  if (hash.length > LONGEST_LINK) return { state: {}, camera: null, scene: null };
   const link = new URLSearchParams(hash.replace(/^#/, ""));
   const state = {};
   for (const key of ["numbers", "jaw"]) {
@@ -130,5 +131,6 @@ function readLink(hash, orbiting, lenses) {
   }
   const marks = marksIn(link, orbiting);
   if (marks.length) state.marks = marks;
-  return { state, camera: cameraIn(link.get("camera"), orbiting, lenses) };
+  const camera = cameraIn(link.get("camera"), orbiting, lenses);
+  return { state, camera, scene: link.get("scene") };
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -174,6 +175,7 @@ def build_page(
             view["photo"] = encode_jpeg(photos[camera.name], jpeg_quality)
         views.append(view)
     scene = {
+        "id": hashlib.sha256(gaussians.means.tobytes()).hexdigest()[:12],  # of links: where it lies
         "format": described,
         "background": list(gaussians.background),
         "orbiting": describe_orbit(orbit),

@@ -23,10 +23,11 @@ function readAddress(viewer, tools) {
   viewer.still = wanted.has("still");
   byId("bar").hidden = byId("label").hidden = wanted.has("bare");
   const { views, orbiting } = viewer.scene;
-  const { state, camera } = readLink(hash, orbiting, views.length);
+  const { state, camera, scene } = readLink(hash, orbiting, views.length);
   // a link with a camera is of the whole page: what it does not name is as at first
   const whole = camera ? { ...new Store().now, ...state } : state;
   if (Object.keys(whole).length) tools.show(tools.possible(whole));
+  if (camera || state.marks) tools.comesFrom(scene);
   if (camera) {
     viewer.stand(camera);
     return true;

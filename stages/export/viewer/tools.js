@@ -20,6 +20,7 @@ class Tools {
     this.viewer = viewer;
     this.store = viewer.store;
     this.store.listeners.push(() => viewer.wake(false));
+    this.origin = viewer.scene.id;  // the scene that marks are of
     for (const kind of ["focus", "blur"]) {  // the crosshair comes and goes
       viewer.canvas.addEventListener(kind, () => viewer.wake(false));
     }
@@ -31,12 +32,12 @@ class Tools {
   }
 
   /** Say it to everybody: what was asked for could not be done, or nothing else shows that it was. */
-  tell(text) {
+  tell(text, seconds = 5) {
     this.say(text);
     byId("told").textContent = text;
     byId("told").hidden = false;
     clearTimeout(this.telling);
-    this.telling = setTimeout(() => { byId("told").hidden = true; }, 5000);
+    this.telling = setTimeout(() => { byId("told").hidden = true; }, 1000 * seconds);
   }
 
   /** Can the scene show this at all? */
@@ -186,9 +187,20 @@ class Tools {
     else if (marks.length) this.remove(marks.length - 1);
   }
 
+  /** Marks and camera come from a link of this scene, or of another one. @param {?string} scene */
+  comesFrom(scene) {
+    const { id } = this.viewer.scene;
+    this.origin = scene ?? id;
+    const elsewhere = byId("elsewhere");
+    elsewhere.hidden = this.origin === id;
+    if (!elsewhere.hidden) this.tell(elsewhere.textContent.replace(/\s+/g, " "), 20);
+  }
+
+  /** Marks of another scene stay said to be so when they are passed on. */
   link() {
-    const { camera, lens } = this.viewer;
-    return `#${linkOf(this.store.now, camera, lens)}`;
+    const { camera, lens, scene } = this.viewer;
+    const { marks } = this.store.now;
+    return `#${linkOf(this.store.now, camera, lens, marks.length ? this.origin : scene.id)}`;
   }
 
   /** Put camera, marks and all into the address, and the address into the clipboard. */
