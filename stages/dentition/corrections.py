@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
@@ -148,10 +149,10 @@ def _as_taken(dentition: Dentition, view: View) -> tuple[Dentition, View]:
     )
 
 
-def removed_crowns(
+def crowns_before(
     dentition: Dentition, view: View, photo: PhotoCorrection, mirrored: bool
-) -> list[tuple[Place, Crown | None]]:
-    """What a person has said to be no tooth.
+) -> list[list[Crown]]:
+    """What was there before each change that a person asked for.
 
     Args:
         dentition: as it was read from the photograph.
@@ -160,21 +161,19 @@ def removed_crowns(
         mirrored: the crowns are to be those of the picture turned over.
 
     Returns:
-        For each removal the place that it names, and the crown there; None: none is read there.
+        For each change the crown that it is about, and of a split that parts what was read as two
+        the other one as well; empty: none is read there.
     """
     dentition, view = _as_taken(dentition, view)
-    crowns, found = list(dentition.all_crowns), list[tuple[Place, Crown | None]]()
+    crowns, found = list(dentition.all_crowns), list[list[Crown]]()
     for change in photo.crowns:
-        crown = None
-        try:
+        before = list(crowns)
+        with suppress(RequestError):  # the next run says so
             index = _crown_at(crowns, view.working_place(change.at), change.at, "")
-            crown = crowns[index]
             _change(crowns, index, change, view, "")
-        except RequestError:  # the next run says so
-            pass
-        if change.remove:
-            width = dentition.size[0]
-            found.append((change.at, mirrored_crown(crown, width) if crown and mirrored else crown))
+        changed = [crown for crown in before if not any(crown is now for now in crowns)]
+        width = dentition.size[0]
+        found.append([mirrored_crown(crown, width) if mirrored else crown for crown in changed])
     return found
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import html
 import json
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.artifacts.dental.corrections import Corrections, PhotoCorrection
 from pipeline.artifacts.teeth import Teeth
 from pipeline.store import Store
 from pipeline.studies.report import run_report
+from stages.dentition.corrections import apply_corrections
 from tests import teeth_case as case
 from tests.browser import browse, console
 from tests.studies.report_case import write_result
@@ -60,6 +64,33 @@ def doubtful_case(
     store.failures.keep("init", {}, {"teeth": teeth or case.teeth("it is <b>blurred</b>")})
     store.failures.record("init", "key", failure)
     return folder
+
+
+#: A place where no crown is, be it that one was.
+NOWHERE = (4.0, 8.0)
+
+
+def corrected_case(folder: Path, read: Teeth, said: Mapping[str, PhotoCorrection]) -> Path:
+    """A workspace of a run with this in its `teeth.yaml`; what is `NOWHERE` was said after it."""
+    there = {
+        name: replace(photo, crowns=tuple(c for c in photo.crowns if c.at != NOWHERE))
+        for name, photo in said.items()
+    }
+    workspace = doubtful_case(folder, apply_corrections(read, case.views(), Corrections(there)))
+    request = json.loads((workspace / "request.json").read_text())
+    request["stages"] = ["views", "teeth", "init"]
+    (workspace / "request.json").write_text(json.dumps(request))
+    write_result(workspace, "teeth", [read])
+    lines = ["photographs:"]
+    for name, photo in said.items():
+        lines += [f'  "{name}":', *["    mirrored: true"] * bool(photo.mirrored), "    crowns:"]
+        for change in photo.crowns:
+            what = f"tooth: {change.tooth}" if change.tooth else "remove: true"
+            if change.split:
+                what = f"split: {[list(place) for place in change.split]}"
+            lines.append(f"    - {{at: {list(change.at)}, {what}}}")
+    case.write(workspace / "teeth.yaml", "\n".join(lines))
+    return workspace
 
 
 def data_of(page: str) -> dict[str, Any]:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 
 from pipeline.artifacts.dental.corrections import (
-    Corrections,
     CrownCorrection,
     PhotoCorrection,
     read_corrections,
@@ -17,11 +14,8 @@ from pipeline.studies.report import run_report
 from stages.dentition.corrections import apply_corrections
 from tests import teeth_case as case
 from tests.browser import needs_chromium
-from tests.studies.check_case import SAVE, data_of, doubtful_case, probed
-from tests.studies.report_case import write_result
+from tests.studies.check_case import NOWHERE, SAVE, corrected_case, data_of, probed
 
-#: A place where no crown is, be it that one was.
-NOWHERE = (4.0, 8.0)
 #: Of the first photograph, a mirror image, two crowns are removed, of which the first was numbered
 #: before, and what isn't there; of the last one all.
 SAID = {
@@ -48,29 +42,8 @@ def as_read() -> Teeth:
     return Teeth((*case.teeth().views[:2], few))
 
 
-def corrected_case(folder: Path) -> Path:
-    """A workspace of a run with what is `SAID` in its `teeth.yaml`."""
-    read = as_read()
-    first = SAID["0_right.jpg"]
-    there = tuple(change for change in first.crowns if change.at != NOWHERE)
-    said = Corrections({**SAID, "0_right.jpg": replace(first, crowns=there)})
-    workspace = doubtful_case(folder, apply_corrections(read, case.views(), said))
-    request = json.loads((workspace / "request.json").read_text())
-    request["stages"] = ["views", "teeth", "init"]
-    (workspace / "request.json").write_text(json.dumps(request))
-    write_result(workspace, "teeth", [read])
-    lines = ["photographs:"]
-    for name, photo in SAID.items():
-        lines += [f'  "{name}":', *["    mirrored: true"] * bool(photo.mirrored), "    crowns:"]
-        for change in photo.crowns:
-            what = f"tooth: {change.tooth}" if change.tooth else "remove: true"
-            lines.append(f"    - {{at: {list(change.at)}, {what}}}")
-    case.write(workspace / "teeth.yaml", "\n".join(lines))
-    return workspace
-
-
 def test_what_was_removed_is_listed_where_it_was(tmp_path: Path) -> None:
-    workspace = corrected_case(tmp_path / "case")
+    workspace = corrected_case(tmp_path / "case", as_read(), SAID)
     run_report(workspace)
     first, second, third = data_of((workspace / "check.html").read_text())["photographs"]
     assert [crown["at"] for crown in first["removed"]] == [
@@ -88,7 +61,7 @@ def test_what_was_removed_is_listed_where_it_was(tmp_path: Path) -> None:
 
 
 def test_what_a_run_has_not_removed_yet_is_shown_once(tmp_path: Path) -> None:
-    workspace = corrected_case(tmp_path / "case")
+    workspace = corrected_case(tmp_path / "case", as_read(), SAID)
     at = list(case.original(3, "upper"))
     text = f"photographs: {{1_front.jpg: {{crowns: [{{at: {at}, remove: true}}]}}}}"
     case.write(workspace / "teeth.yaml", text)
@@ -134,7 +107,7 @@ BACK = """
 
 @needs_chromium
 def test_what_was_removed_is_brought_back_in_a_browser(tmp_path: Path) -> None:
-    workspace = corrected_case(tmp_path / "case")
+    workspace = corrected_case(tmp_path / "case", as_read(), SAID)
     result = probed(workspace, tmp_path / "browser", BACK, SAVE)
     line = ",line-through"
     assert result["start"] == ["13 12 11 21 22 43 42 41 32 33", ["24" + line, "31" + line], 0]

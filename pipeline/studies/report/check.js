@@ -60,11 +60,13 @@ const undo = () => {
   draw();
 };
 const put = (photo, crown, number) => {
-  // An earlier number of the same crown is replaced; a split before it stays.
-  photo.entries = photo.entries.filter((entry) => !entry.tooth
-    || !contains(crown.outline, shownAt(photo, entry.at)));
-  photo.entries = [...photo.entries,
-    { at: original(photo, innerPoint(crown.outline)), tooth: number }];
+  // An earlier number of the same crown is replaced; a split before it stays, and what was before.
+  const split = photo.entries.indexOf(splitSaid(photo, crown));
+  const earlier = photo.entries.filter((entry, k) => k > split && entry.tooth
+    && contains(crown.outline, shownAt(photo, entry.at)));
+  const was = numberSaid(photo, crown)?.was ?? [crown];
+  photo.entries = [...photo.entries.filter((entry) => !earlier.includes(entry)),
+    { at: original(photo, innerPoint(crown.outline)), tooth: number, was }];
   photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
     : { ...other, number, doubt: 0, said: true, jaw: jawOf(number) }));
 };
@@ -125,18 +127,55 @@ const bringBack = (photo, { at, ...crown }) => {
   });
   say("Brought back.");
 };
+// What was said of a crown, now or before, is said no longer: its number, else the split it is of.
+const takeBackNumber = (photo, crown) => {
+  const entry = numberSaid(photo, crown);
+  const { number = 0, doubt = 1, jaw = crown.jaw, said = false } = entry.was[0] ?? {};
+  change(() => {
+    photo.entries = photo.entries.filter((other) => other !== entry);
+    photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
+      : { ...other, number, doubt, jaw, said }));
+  });
+  say(`Taken back: it ${number ? `is ${number}` : "has no number"} again.`);
+};
+const takeBackSplit = (photo, crown) => {
+  const entry = splitSaid(photo, crown);
+  const inside = (point) => entry.was.some(({ outline }) => contains(outline, point));
+  change(() => {
+    const at = photo.entries.indexOf(entry);
+    photo.entries = photo.entries.filter((other, k) => k < at
+      || (k > at && !inside(shownAt(photo, other.at))));
+    const isPart = ({ outline }) => outline.length && inside(innerPoint(outline));
+    const whole = entry.was.map(withId);
+    photo.crowns = [...photo.crowns.filter((other) => !isPart(other)), ...whole];
+    photo.removed = photo.removed.filter((other) => !isPart(other));
+    chosen = { photo, id: whole[0].id };
+  });
+  say("Taken back: it is not split.");
+};
+const takeBack = () => {
+  const { photo } = chosen;
+  const crown = chosenCrown();
+  if (numberSaid(photo, crown)) takeBackNumber(photo, crown);
+  else if (splitSaid(photo, crown)) takeBackSplit(photo, crown);
+  else say("Nothing was said of this crown.");
+};
+const takeBackLost = (photo, entry) => {
+  change(() => { photo.entries = photo.entries.filter((other) => other !== entry); });
+  say("Taken back.");
+};
 const turnOver = (photo) => {
   change(() => {
     photo.mirrored = !photo.mirrored;
     photo.mirroredSaid = photo.mirrored;
     photo.roll = -photo.roll;
     photo.kind = { right: "left", left: "right" }[photo.kind] ?? photo.kind;
-    for (const kind of ["crowns", "removed"]) {
-      photo[kind] = photo[kind].map((crown) => ({ ...crown,
-        outline: crown.outline.map(([x, y]) => [photo.width - x, y]),
-        number: crown.number && crown.doubt ? otherSide(crown.number) : crown.number,
-        offered: crown.offered.map(([tooth, share]) => [otherSide(tooth), share]) }));
-    }
+    const over = (crown) => ({ ...crown,
+      outline: crown.outline.map(([x, y]) => [photo.width - x, y]),
+      number: crown.number && crown.doubt ? otherSide(crown.number) : crown.number,
+      offered: crown.offered.map(([tooth, share]) => [otherSide(tooth), share]) });
+    for (const kind of ["crowns", "removed"]) photo[kind] = photo[kind].map(over);
+    photo.entries = photo.entries.map((entry) => ({ ...entry, was: entry.was?.map(over) }));
   });
   say(photo.mirrored ? `${photo.name} is taken as a mirror image and turned over.`
     : `${photo.name} is taken as it is.`);
@@ -162,7 +201,7 @@ const finishCut = () => {
   const { from, to } = cut;
   change(() => {
     photo.entries = [...photo.entries, { at: original(photo, innerPoint(crown.outline)),
-      split: [original(photo, from), original(photo, to)] }];
+      split: [original(photo, from), original(photo, to)], was: [crown] }];
     const made = parts.map((outline) => withId({ ...crown, outline, number: 0, doubt: 1, said: false }));
     photo.crowns = photo.crowns.flatMap((other) => (other === crown ? made : [other]));
     chosen = { photo, id: rowOf(photo, crown.jaw).find((other) => made.includes(other)).id };
@@ -243,6 +282,8 @@ document.addEventListener("keydown", (event) => {
     remove();
   } else if (key.toLowerCase() === "s" && !cut) {
     startCut();
+  } else if (key.toLowerCase() === "t" && !cut) {
+    takeBack();
   } else {
     return;
   }

@@ -127,12 +127,16 @@ def content(
 def _photograph(
     view: View, seen: Dentition, read: Dentition, label: str, earlier: PhotoCorrection
 ) -> Content:
-    from stages.dentition.corrections import removed_crowns
+    from stages.dentition.corrections import crowns_before
 
-    removed = [
-        {"at": list(at)} | (_crown(crown) if crown else _NO_CROWN)
-        for at, crown in removed_crowns(read, view, earlier, bool(seen.mirrored))
+    before = [
+        [_crown(crown) for crown in crowns]
+        for crowns in crowns_before(read, view, earlier, bool(seen.mirrored))
     ]
+    removed = [
+        {"at": list(change.at)} | (was[0] if was else _NO_CROWN)
+        for change, was in zip(earlier.crowns, before, strict=True) if change.remove
+    ]  # fmt: skip
     gone = [crown["outline"] for crown in removed]
     crowns = [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3]
     shown = picture(
@@ -154,7 +158,7 @@ def _photograph(
         "doubts": list(seen.doubts),
         "crowns": [crown for crown in crowns if crown["outline"] not in gone],
         "removed": removed,
-        "earlier": _entries(earlier),
+        "earlier": _entries(earlier, before),
     }
 
 
@@ -171,11 +175,15 @@ def _crown(crown: Crown) -> Content:
     }
 
 
-def _entries(photo: PhotoCorrection) -> Content:
-    """Corrections as they stand in the file, so that a new file can keep them."""
+def _entries(photo: PhotoCorrection, before: list[list[Content]]) -> Content:
+    """Corrections as they stand in the file, so that a new file can keep them.
+
+    Args:
+        before: the crowns that each is about as they were before it, to take it back.
+    """
     crowns: list[Content] = []
-    for change in photo.crowns:
-        entry: Content = {"at": list(change.at)}
+    for change, was in zip(photo.crowns, before, strict=True):
+        entry: Content = {"at": list(change.at), "was": was}
         if change.tooth is not None:
             entry["tooth"] = change.tooth
         elif change.split is not None:

@@ -163,6 +163,16 @@ const original = (photo, point) =>
   turnedOver(photo, point).map((value, axis) => value * photo.scale[axis] + photo.corner[axis]);
 const shownAt = (photo, at) => turnedOver(photo,
   at.map((value, axis) => (value - photo.corner[axis]) / photo.scale[axis]));
+const isNear = ({ outline }, point) => contains(outline, point)
+  || borderDistance(outline, point) <= (extent(outline)[2] - extent(outline)[0]) / 2;
+// What was said of a crown last, and can be taken back: its number; the split that it is a part of.
+const numberSaid = (photo, crown) => photo.entries.findLast((entry) => entry.tooth
+  && entry.tooth === crown.number && isNear(crown, shownAt(photo, entry.at)));
+const splitSaid = (photo, crown) => photo.entries.findLast((entry) => entry.split
+  && entry.was.some(({ outline }) => contains(outline, innerPoint(crown.outline))));
+// Numbers and splits of what isn't read any more: they keep a run from going on.
+const lostEntries = (photo) => photo.entries.filter((entry) => (entry.tooth || entry.split)
+  && !entry.was.length && !photo.crowns.some((crown) => isNear(crown, shownAt(photo, entry.at))));
 // What is said of a picture shown turned over is said of a mirror image.
 const mirroredOf = (photo) => photo.mirroredSaid ?? (photo.mirrored
   && (photo.kindSaid !== null || photo.entries.some((entry) => entry.tooth)) ? true : null);

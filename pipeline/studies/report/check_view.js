@@ -113,6 +113,18 @@ const removedRow = (photo) => {
     make("div", { class: "chips", role: "group", "aria-label": "removed" },
       ...photo.removed.map(button))) : null;
 };
+const lostRow = (photo) => {
+  const button = (entry) => {
+    const what = entry.tooth ? String(entry.tooth) : "split";
+    return make("button", { type: "button", class: "chip q0 gone",
+      "aria-label": `${what} take back: said before, nothing is read there any more`,
+      onclick: () => takeBackLost(photo, entry) }, make("s", {}, what), " take back");
+  };
+  const lost = lostEntries(photo);
+  return lost.length ? make("div", {}, make("span", { class: "what" }, "lost"),
+    make("div", { class: "chips", role: "group", "aria-label": "said of what is not read any more" },
+      ...lost.map(button))) : null;
+};
 const drawCrowns = (photo, card) => {
   const wrong = new Set(problemsOf(photo).flatMap((problem) => problem.crowns));
   const shown = [...photo.crowns].sort((a, b) => (a.id === chosen?.id) - (b.id === chosen?.id));
@@ -171,7 +183,7 @@ const drawCard = (photo) => {
           onclick: () => choose(photo, crown.id),
         }, label(crown)))));
   });
-  card.rows.replaceChildren(...[...rows, removedRow(photo)].filter(Boolean));
+  card.rows.replaceChildren(...[...rows, removedRow(photo), lostRow(photo)].filter(Boolean));
 };
 
 const drawRest = (panel) => {
@@ -194,7 +206,8 @@ const drawRest = (panel) => {
       : make("p", { class: "soft" }, "Compare the numbers with the photographs all the same."),
     make("h3", {}, "Keys"),
     make("ul", { class: "keys" }, ...[["click or Tab", "choose a crown"], ["← → ↑ ↓", "next crown"],
-      ["1 6", "its number"], ["Del", "is no tooth"], ["S", "split"], ["Ctrl Z", "undo"],
+      ["1 6", "its number"], ["Del", "is no tooth"], ["S", "split"],
+      ["T", "take back what was said of it"], ["Ctrl Z", "undo"],
       ["Esc", "back"]].map(([keys, text]) =>
       make("li", {}, ...keys.split(" ").flatMap((key) => [/^(or|click)$/.test(key) ? key
         : make("kbd", {}, key), " "]), text))));
@@ -248,7 +261,11 @@ const drawChosen = (panel, photo, crown) => {
         cut ? "Draw the line …" : "Split"),
       crown.number && row.length > 1 ? make("button", { type: "button", onclick: numberRow,
         title: "Give its neighbours the numbers that follow, to both ends of the row" },
-      "Number the row from here") : null));
+      "Number the row from here") : null,
+      numberSaid(photo, crown) ? make("button", { type: "button",
+        onclick: () => takeBackNumber(photo, crown) }, `Take back ${crown.number}`) : null,
+      splitSaid(photo, crown) ? make("button", { type: "button",
+        onclick: () => takeBackSplit(photo, crown) }, "Take back the split") : null));
 };
 let shown = null; // what was chosen when the page was last drawn
 // In narrow windows the panel lies over the photographs: what is chosen must be seen beside it.
@@ -289,7 +306,7 @@ const draw = () => {
     make("img", { src: photo.picture, alt: `Photograph ${photo.name}, left out.` }),
     make("figcaption", {}, make("b", {}, photo.name), make("br"), photo.aside || "left out by you"),
     photo.crowns.length ? make("button", { type: "button", onclick: () => useIt(photo, true) },
-      "Use it") : removedRow(photo))));
+      "Use it") : removedRow(photo), lostRow(photo))));
   find("undo").setAttribute("aria-disabled", String(!past.length));
   if (before !== null && held.isConnected) scrollBy(0, held.getBoundingClientRect().top - before);
   uncover();
