@@ -177,6 +177,13 @@ def test_a_path_through_many_shaky_cameras_is_smooth() -> None:
     assert np.linalg.norm(eyes - orbit.centre, axis=1) == pytest.approx(4, abs=0.2)
 
 
+def test_one_place_of_the_path_is_its_middle() -> None:
+    cameras = scene.ball_cameras()
+    orbit = find_orbit(cameras, [4.0] * 3)
+    (one,), (_, middle, _) = (between(orbit, cameras, count) for count in (1, 3))
+    assert np.allclose(one.cam_from_world, middle.cam_from_world)
+
+
 def test_a_single_camera_still_gets_a_small_orbit() -> None:
     (camera,) = scene.ball_cameras()[1:2]
     orbit = find_orbit([camera], [None])

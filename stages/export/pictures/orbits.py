@@ -234,9 +234,12 @@ def widened(cameras: Sequence[Camera], points: Array) -> list[Camera]:
 
 
 def between(orbit: Orbit, cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """`count` evenly spread cameras along the path, with the size of the first camera."""
+    """`count` evenly spread cameras along the path, with the size of the first camera.
+
+    One alone stands in the middle.
+    """
     low, high = float(orbit.azimuths.min()), float(orbit.azimuths.max())
-    azimuths = np.linspace(low, high, count)
+    azimuths = np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
     poses = path_poses(orbit, azimuths, np.zeros(count))
     return _cameras(poses, lens(cameras, cameras[0].width, cameras[0].height))
 
