@@ -136,6 +136,15 @@ def test_paths_of_a_list_begin_at_its_folder(tmp_path: Path) -> None:
     assert case.overrides == (f"views.masks={tmp_path / 'm'}", "views.held_out=[0.jpg]")
 
 
+def test_a_list_may_begin_at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures(tmp_path / "home" / "p")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "list.csv").write_text("name,photographs\na,~/p\nb,~nobody-is-called-so/p\n")
+    first, second = read_cases(tmp_path / "list.csv", Names({}))
+    assert [Path(path).parent for path, _, _ in first.files] == [tmp_path / "home" / "p"] * 2
+    assert second.settled == "wrong" and "home of a user that there isn't" in second.reason
+
+
 def test_a_list_with_what_a_spreadsheet_leaves(tmp_path: Path) -> None:
     pictures(tmp_path / "p")
     text = "name;photographs;settings;;\n;;;;\na;p;;;\n\na;p;;;\nb;p;;;x\n"

@@ -13,6 +13,7 @@ from pipeline.studies.batch.find import Names, as_case
 from pipeline.studies.batch.records import Case
 from pipeline.untrusted.files import Kind, UnusableFile, read
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.paths import user_path
 
 LISTING = Kind("a list of cases", 1 << 24)
 COLUMNS = ("name", "photographs", "settings")
@@ -91,9 +92,12 @@ def _case(row: dict[str, str], excess: int, number: int, path: Path) -> Case:
         why = f"Line {number} has {excess} entries too many; put those with a comma in quotes."
         return Case("", called, settled="wrong", reason=why)
     parts = [part.strip() for part in row.get("photographs", "").split(SEPARATOR)]
-    images = [path.parent / Path(part) for part in parts if part]
-    if not images:
+    if not any(parts):
         return Case("", called, settled="wrong", reason="It names no photographs.")
+    try:  # no shell has replaced a ~
+        images = [path.parent / user_path(part, "photographs") for part in parts if part]
+    except PipelineError as error:
+        return Case("", called, settled="wrong", reason=str(error))
     settings = [part.strip() for part in row.get("settings", "").split(SEPARATOR)]
     overrides = tuple(anchored(part, path.parent) for part in settings if part)
     if len(images) == 1 and images[0].is_dir():
