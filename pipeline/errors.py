@@ -16,9 +16,14 @@ PICTURES = " Pictures that show it: "
 
 
 class PipelineError(Exception):
-    """A failure that is explained to the user in one paragraph, never with a traceback."""
+    """A failure that is explained to the user in one paragraph, never with a traceback.
+
+    Attributes:
+        stage: that it ended; empty: none had begun.
+    """
 
     exit_status = 1
+    stage = ""
 
     def __init__(self, message: str = "") -> None:
         super().__init__(readable(message))

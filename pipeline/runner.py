@@ -276,6 +276,7 @@ class Runner:
     def _fail(self, error: BaseException, name: str, key: str) -> PipelineError:
         """The failure as it is told; the store is left as it was, but for a record of it."""
         failure = explained(error, name, self.request.workspace, self._thrift())
+        failure.stage = name
         with contextlib.suppress(OSError):  # the first error is the one to tell
             self.store.discard_outputs(name, key)
         if isinstance(failure, ReconstructionError):

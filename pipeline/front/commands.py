@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, load_config
-from pipeline.errors import PICTURES, PipelineError, ReconstructionError, StageError
+from pipeline.errors import (
+    PICTURES,
+    PipelineError,
+    ReconstructionError,
+    RequestError,
+    StageError,
+)
 from pipeline.front.log import Log
 from pipeline.front.pages import DrawnBeside, write_pages
+from pipeline.pages.page import REPORT
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.runner import Runner
 from pipeline.running.outcomes import RunSummary
@@ -113,6 +120,10 @@ def _run(
                 why, shown, pictures = str(error).partition(PICTURES)
                 way = f"To put it right, open {check} in a browser."
                 error.args = (f"{why} {way}{shown}{pictures}",)
+            raise
+        except RequestError as error:
+            if error.stage and (workspace / REPORT).is_file():  # it shows an earlier run
+                write_pages(workspace, config, reporter, drawing)
             raise
         summary.report, summary.check = write_pages(workspace, config, reporter, drawing)
     return summary

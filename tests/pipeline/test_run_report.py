@@ -68,6 +68,21 @@ def test_a_failed_stage_is_diagnosed_and_later_results_are_not_shown(toys: Path)
     assert keys["publish"][:12] not in page
 
 
+def test_what_shows_an_earlier_run_is_renewed_where_a_stage_refuses(toys: Path) -> None:
+    listener = Listener()
+    with pytest.raises(pipeline.RequestError, match="is full"):
+        start(toys, "count.fail=disk", reporter=listener)
+    assert not (toys / "w" / "report.html").exists(), "there is nothing to show yet"
+    start(toys)
+    with pytest.raises(pipeline.RequestError, match="is full"):
+        start(toys, "count.fail=disk", "count.steps=7")
+    page = (toys / "w" / "report.html").read_text()
+    assert "count failed" in page and "is full" in page
+    with pytest.raises(pipeline.RequestError, match=r"count\.stepz"):
+        start(toys, "count.stepz=7")
+    assert (toys / "w" / "report.html").read_text() == page
+
+
 def test_what_is_stale_is_said(toys: Path) -> None:
     start(toys)
     (toys / "images" / "1.txt").write_text("9")

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PipelineError, ReconstructionError, RequestError, StageError
+from pipeline.errors import PipelineError, ReconstructionError, RequestError
 from pipeline.files import canonical_json, sha256_file, sha256_text
 from pipeline.front.commands import run
 from pipeline.front.progress import LineReporter
@@ -161,8 +161,8 @@ def _outcome(
             error.__cause__ is not None and is_disk_full(error.__cause__, workspace)
         ):
             return {"state": "stopped", "reason": str(error)}
-        # of other faults no page was written: one that is there shows an earlier run
-        pages = PAGES if isinstance(error, ReconstructionError | StageError) else ()
+        # where no stage had begun no page was written: one that is there shows an earlier run
+        pages = PAGES if isinstance(error, PipelineError) and error.stage else ()
         links = _links(workspace, pages)
         return {"state": _state_of(error), "reason": _reason_of(error), "links": links}
     return {"state": "done", "links": _links(workspace, LINKS), **_figures(summary)}
