@@ -153,6 +153,13 @@ def test_photographs_set_aside_take_no_part_unless_their_order_is_given(tmp_path
     asked.clear()
     run(tmp_path / "b", monkeypatch, found_teeth(), read, asked, order="right,frontal,left")
     assert [d.name for d in asked] == ["000", "001", "002"]
+    asked.clear()
+    left_out = "photographs: {p2.jpg: {use: false}}"
+    run(
+        tmp_path / "c", monkeypatch, found_teeth(), read, asked, left_out,
+        order="right,frontal,left",
+    )  # fmt: skip
+    assert [d and d.name for d in asked] == ["000", "001", None]
 
 
 def test_teeth_that_were_not_read_are_asked_for(tmp_path):

@@ -17,7 +17,7 @@ from pipeline.artifacts.teeth import Teeth as TeethArtifact
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
-from stages.dentition.corrections import SIDES, says_side
+from stages.dentition.corrections import LEFT_OUT, SIDES, says_side
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.read import labelled_teeth, set_aside_reasons, turned_as_said
@@ -47,9 +47,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
     config: InitConfig = context.config
     read = labelled_teeth(context, views)
     given, views = views, turned_as_said(context, views)
-    dentitions = chosen_dentitions(read, views)
-    if config.dental.order is not None:
-        dentitions = [d or e for d, e in zip(dentitions, read.views, strict=True)]
+    dentitions = chosen_dentitions(read, views, ordered=config.dental.order is not None)
     names = [photo_name(view) for view in views.views]
     try:
         teeth = reconstruct_teeth(
@@ -80,9 +78,15 @@ def from_teeth(context: StageContext, views: Views) -> None:
     _write(context, given, teeth, numbered)
 
 
-def chosen_dentitions(read: TeethArtifact, views: Views) -> list[Dentition | None]:
-    """View by view its crowns, None where it takes no part."""
-    chosen = {dentition.name: dentition for dentition in read.chosen}
+def chosen_dentitions(read: TeethArtifact, views: Views, ordered: bool) -> list[Dentition | None]:
+    """View by view its crowns, None where it takes no part.
+
+    Args:
+        ordered: a person has said what each photograph shows: only what a person leaves out is set
+            aside.
+    """
+    kept = [d for d in read.views if d.set_aside != LEFT_OUT] if ordered else read.chosen
+    chosen = {dentition.name: dentition for dentition in kept}
     return [chosen.get(view.name) for view in views.views]
 
 
