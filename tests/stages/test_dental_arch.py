@@ -365,6 +365,18 @@ def test_numbers_that_contradict_are_refused() -> None:
         fit(dentitions, SHORT)
 
 
+@pytest.mark.parametrize(("view", "step"), [(1, 1), (2, 0)], ids=["side by side", "elsewhere"])
+def test_a_primary_tooth_and_its_successor_are_not_both_taken_for_one(view: int, step: int) -> None:
+    dentitions, _, teeth = three()
+    tooth = 21
+    index = teeth[1][0].index(tooth)
+    dentitions[1] = with_crown(dentitions[1], index, number=tooth, doubt=0.0)
+    other = teeth[view][0].index(tooth) + step
+    dentitions[view] = with_crown(dentitions[view], other, number=61, doubt=0.0)
+    with pytest.raises(RequestError, match=f"21 in photo 1, 61 in photo {view}"):
+        fit(dentitions, SHORT)
+
+
 def test_unplaceable_photographs_are_named() -> None:
     dentitions, _, _ = three()
     few = replace(dentitions[1], upper=dentitions[1].upper[:2], lower=())

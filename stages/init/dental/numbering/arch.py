@@ -130,10 +130,10 @@ def fit_arch(
         options,
         order=None if options.order is None else tuple(options.order[i] for i in placeable),
     )
-    fixed = _fixed_labels(read)
+    shown = [names[i] for i in placeable]
+    fixed = _fixed_labels(read, shown)
     focal, deviation = _focal_priors([focals[i] for i in placeable], read, options)
     rows = [seen_rows(dentition) for dentition in read]
-    shown = [names[i] for i in placeable]
 
     rolls = [dentition.roll for dentition in read]
     held = None if cameras is None else held_cameras([cameras[i] for i in placeable], rolls)
@@ -212,15 +212,29 @@ def _check(
             )
 
 
-def _fixed_labels(dentitions: list[Dentition]) -> Fixed:
-    """Crowns whose number a person has said (doubt 0) -> position."""
+def _fixed_labels(dentitions: list[Dentition], photos: list[str]) -> Fixed:
+    """Crowns whose number a person has said (doubt 0) -> position.
+
+    Raises:
+        RequestError: a primary tooth and its successor are said to stand in one place.
+    """
     fixed: Fixed = {}
+    said: dict[int, tuple[int, str]] = {}
     for view, dentition in enumerate(dentitions):
         for jaw, name in enumerate(JAWS):
             for crown, found in enumerate(dentition.crowns(name)):
-                tooth = permanent_of(found.number) if found.number else 0
-                if found.doubt == 0 and tooth in teeth_of(name):
-                    fixed[view, jaw, crown] = position_of(tooth)
+                tooth = permanent_of(found.number)
+                if found.doubt or tooth not in teeth_of(name):
+                    continue
+                fixed[view, jaw, crown] = position_of(tooth)
+                number, photo = said.setdefault(tooth, (found.number, photos[view]))
+                if number != found.number:
+                    raise RequestError(
+                        f"The tooth numbers given contradict each other: {number} in {photo}, "
+                        f"{found.number} in {photos[view]}. A primary tooth and the one that "
+                        "follows it have one place in the row: say the same of it everywhere; "
+                        "where both stand, give one its number and remove the other."
+                    )
     return fixed
 
 
