@@ -16,7 +16,7 @@ from pipeline.artifacts.dental.corrections import (
     PhotoCorrection,
     Place,
 )
-from pipeline.artifacts.dental.fdi import Jaw, is_upper
+from pipeline.artifacts.dental.fdi import JAWS, WISDOM, Jaw, is_upper
 from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
@@ -28,6 +28,7 @@ from stages.dentition.crowns import (
     with_outlines,
 )
 from stages.dentition.parts import perhaps_one
+from stages.dentition.tooth_rows import number_is_said
 
 Array = npt.NDArray[np.float64]
 
@@ -54,8 +55,8 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
         to correct. Those of mirror images are of the pictures turned over.
 
     Raises:
-        RequestError: a photograph or a crown that isn't there, or another picture than what was
-            said is of; the message names it.
+        RequestError: a photograph or a crown that isn't there, another picture than what was said
+            is of, or a wisdom tooth between others; the message names it.
     """
     if not corrections:
         return teeth
@@ -135,10 +136,24 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
             upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
             lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
         )
+    for jaw in JAWS:
+        _check_wisdom_teeth(corrected.crowns(jaw), where)
     if not mirrored:
         return replace(corrected, mirrored=mirrored)
     turned = mirrored_dentition(corrected)
     return replace(turned, kind=photo.kind or turned.kind)
+
+
+def _check_wisdom_teeth(row: tuple[Crown, ...], where: str) -> None:
+    """Refuse a wisdom tooth between others: the row has no place for it, and would go on around."""
+    numbered = [crown for crown in row if crown.number]
+    for crown in numbered[1:-1]:
+        if number_is_said(crown) and crown.number % 10 == WISDOM:
+            raise RequestError(
+                f"{where}: {crown.number} is a wisdom tooth and stands at an end of its row, but "
+                "there are crowns on both sides of this one. Give it another number, or remove "
+                "what is no tooth beyond it."
+            )
 
 
 def _as_taken(dentition: Dentition, view: View) -> tuple[Dentition, View]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.special import expit, softmax
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, Jaw, primary_of, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, WISDOM, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
 from stages.dentition.changing_teeth import molars_cost, odds_of_left, primary_odds, said_numbers
@@ -48,8 +48,6 @@ LOOKS_IN_ORDER = 1e-3
 LEAST_DOUBT = 1e-4
 #: How the order of a row counts.
 ROWS = ChainOptions()
-#: Place of a wisdom tooth in its quadrant.
-WISDOM = 8
 #: Number and doubt of what is no tooth.
 NONE = 0, 1.0
 

@@ -265,6 +265,16 @@ def test_a_number_of_the_other_jaw_moves_the_crown() -> None:
     assert after.lower[-1].tip[1] < after.lower[-1].zenith[1] or after.lower[-2].number == 34
 
 
+def test_a_wisdom_tooth_between_others_is_refused() -> None:
+    ends = tuple(CrownCorrection(case.original(k, "upper"), t) for k, t in ((0, 18), (5, 28)))
+    assert numbers(applied(v000=PhotoCorrection(crowns=ends))[0])[:6] == [18, 12, 11, 21, 22, 28]
+    between = CrownCorrection(case.original(4, "upper"), tooth=28)
+    with pytest.raises(RequestError, match="'000': 28 is a wisdom tooth"):
+        applied(v000=PhotoCorrection(crowns=(between,)))
+    beyond = CrownCorrection(case.original(5, "upper"), remove=True)
+    assert applied(v000=PhotoCorrection(crowns=(between, beyond)))[0].upper[-1].number == 28
+
+
 def test_photographs_are_left_out_used_and_called_otherwise() -> None:
     teeth = case.teeth("it is blurred")
     after = applied(

@@ -22,6 +22,8 @@ THE_NUMBERS = (
 )
 #: Primary teeth have so many places from the midline.
 PRIMARY_PLACES = 5
+#: Place of a wisdom tooth from the midline.
+WISDOM = 8
 _PRIMARY_LETTERS = "ABCDEFGHIJKLMNOPQRST"
 
 
