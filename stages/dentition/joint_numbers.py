@@ -25,7 +25,6 @@ from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike,
 from stages.dentition.spacing import Row, spacing_cost, spacing_evidence, unit_of
 from stages.dentition.tooth_rows import (
     POSITIONS,
-    ChainOptions,
     crown_evidence,
     number_is_said,
     row_probabilities,
@@ -46,8 +45,6 @@ PART, LEAST_SHOWN = 0.8, 1.0
 #: Weight of the expected places in the order of a row, against what photographs say.
 LOOKS_IN_ORDER = 1e-3
 LEAST_DOUBT = 1e-4
-#: How the order of a row counts.
-ROWS = ChainOptions()
 #: Number and doubt of what is no tooth.
 NONE = 0, 1.0
 
@@ -78,7 +75,6 @@ def agreed_numbers(
     views: Sequence[View],
     cameras: Sequence[Camera],
     depths: Sequence[Map],
-    options: ChainOptions = ROWS,
 ) -> Teeth:
     """The teeth with the numbers that all placed photographs together give their crowns.
 
@@ -90,16 +86,15 @@ def agreed_numbers(
         teeth: as each photograph was read by itself.
         views: the placed photographs.
         cameras, depths: of each, with z-depth [H, W], 0 where unknown.
-        options: of the rows.
     """
     read = {dentition.name: dentition for dentition in teeth.chosen}
     dentitions = [read.get(view.name) for view in views]
     if sum(dentition is not None for dentition in dentitions) < 2:
         return teeth
     overlaps = crown_overlaps(views, dentitions, cameras, depths)
-    numbers, primary = _numbers(overlaps, dentitions, options)
+    numbers, primary = _numbers(overlaps, dentitions)
     changed = {
-        dentition.name: _renumbered(dentition, v, numbers, primary, options)
+        dentition.name: _renumbered(dentition, v, numbers, primary)
         for v, dentition in enumerate(dentitions)
         if dentition is not None
     }
@@ -107,22 +102,20 @@ def agreed_numbers(
     return replace(teeth, views=views_read, pictures={})
 
 
-def _renumbered(
-    dentition: Dentition, view: int, numbers: Numbers, primary: Primary, options: ChainOptions
-) -> Dentition:
+def _renumbered(dentition: Dentition, view: int, numbers: Numbers, primary: Primary) -> Dentition:
     """A photograph's crowns with the numbers agreed on; the others' by the row that these make."""
     known = [numbers.get((view, index)) for index in range(len(dentition.all_crowns))]
     rows, start = {}, 0
     for jaw in JAWS:
         crowns = dentition.crowns(jaw)
-        rows[jaw] = _completed(crowns, known[start : start + len(crowns)], jaw, primary, options)
+        rows[jaw] = _completed(crowns, known[start : start + len(crowns)], jaw, primary)
         start += len(crowns)
     return replace(dentition, upper=rows["upper"], lower=rows["lower"])
 
 
 def _completed(
     crowns: Sequence[Crown], known: Sequence[tuple[int, float] | None], jaw: Jaw,
-    primary: Primary, options: ChainOptions,
+    primary: Primary,
 ) -> tuple[Crown, ...]:  # fmt: skip
     """One row: crowns without an agreed number stand between those that have one, as sure ones."""
     result = list(crowns)
@@ -135,8 +128,8 @@ def _completed(
         if agreed is None or (number and number not in [result[j].number for j in row]):
             row.append(k)
     fixed = [replace(result[k], doubt=0.0) if known[k] else result[k] for k in row]
-    evidence = [crown_evidence(crown, jaw, options) for crown in fixed]
-    shares, _ = row_probabilities(np.array(evidence).reshape(-1, POSITIONS), options)
+    evidence = [crown_evidence(crown, jaw) for crown in fixed]
+    shares = row_probabilities(np.array(evidence).reshape(-1, POSITIONS))
     for k, share in zip(row, shares, strict=True):
         if known[k] is None and not number_is_said(crowns[k]):
             place, number, doubt = int(np.argmax(share)), *NONE
@@ -146,26 +139,24 @@ def _completed(
     return tuple(result)
 
 
-def _numbers(
-    overlaps: Overlaps, dentitions: Sequence[Dentition | None], options: ChainOptions
-) -> tuple[Numbers, Primary]:
+def _numbers(overlaps: Overlaps, dentitions: Sequence[Dentition | None]) -> tuple[Numbers, Primary]:
     crowns = []
     for sighting in overlaps.sightings:
         dentition = dentitions[sighting.view]
         assert dentition is not None
         crowns.append(dentition.all_crowns[sighting.index])
-    looks = [softmax(crown_evidence(crown, crown.jaw, options)) for crown in crowns]
+    looks = [softmax(crown_evidence(crown, crown.jaw)) for crown in crowns]
     groups = same_teeth(overlaps, [JAWS.index(crown.jaw) for crown in crowns], looks)
     whole = _wholes(overlaps, groups, looking_alike(looks))
     rows = []
     for jaw in JAWS:
         found = [
-            _tooth(group, jaw, crowns, overlaps, options)
+            _tooth(group, jaw, crowns, overlaps)
             for k, group in enumerate(groups)
             if crowns[group[0]].jaw == jaw and whole[k] == k and len(group) > 1
         ]
         rows.append([found[k] for k in _order(found, overlaps)])
-    places = _places(rows, options)
+    places = _places(rows)
     named = [
         (tooth, int(np.argmax(share)), float(share.max()))
         for row, shares in zip(rows, places, strict=True)
@@ -197,7 +188,7 @@ def _said_wisdom(group: Sequence[int], crowns: Sequence[Crown]) -> int:
     return next((number for number in said if number % 10 == WISDOM), 0)
 
 
-def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:
+def _places(rows: list[list[_Tooth]]) -> list[Array]:
     """[n, 15] of each row, its teeth's probabilities of the positions and of being no tooth.
 
     First by looks and order; neighbours by these tell how large the mouth is, and the spaces
@@ -206,13 +197,13 @@ def _places(rows: list[list[_Tooth]], options: ChainOptions) -> list[Array]:
     evidence = [np.array([tooth.evidence for tooth in row]).reshape(-1, POSITIONS) for row in rows]
     weights = [np.array([tooth.weight for tooth in row]) for row in rows]
     given = list(zip(evidence, weights, strict=True))
-    first = [row_probabilities(looks, options, weight)[0] for looks, weight in given]
+    first = [row_probabilities(looks, weight) for looks, weight in given]
     standing = _standing(rows, first)
     unit = unit_of(standing)
     if unit is None:
         return first
     return [
-        row_probabilities(looks, options, weight, spacing_evidence(jaw, centres, unit))[0]
+        row_probabilities(looks, weight, spacing_evidence(jaw, centres, unit))
         for (jaw, centres, _), (looks, weight) in zip(standing, given, strict=True)
     ]
 
@@ -245,13 +236,11 @@ def _wholes(overlaps: Overlaps, groups: list[list[int]], alike: Array) -> list[i
     return whole
 
 
-def _tooth(
-    members: list[int], jaw: Jaw, crowns: list[Crown], overlaps: Overlaps, options: ChainOptions
-) -> _Tooth:
+def _tooth(members: list[int], jaw: Jaw, crowns: list[Crown], overlaps: Overlaps) -> _Tooth:
     heard = [crowns[k] for k in members if number_is_said(crowns[k])] or [
         crowns[k] for k in members
     ]
-    looks = np.array([crown_evidence(crown, jaw, options) for crown in heard])
+    looks = np.array([crown_evidence(crown, jaw) for crown in heard])
     weight = len(members) ** JOINT_POWER
     odds = [value for value in map(primary_odds, heard) if value is not None]
     centre = np.median([overlaps.sightings[k].centre for k in members], axis=0)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pipeline.artifacts.dental.fdi import JAWS
 from pipeline.artifacts.teeth import Crown, Dentition
 from stages.dentition.crowns import GAP, Outline, outline_of, with_outlines
-from stages.dentition.tooth_rows import LOOKS, crown_evidence
+from stages.dentition.tooth_rows import crown_evidence
 
 Array = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def perhaps_one(first: Crown, second: Crown) -> bool:
     """May two neighbours of one jaw be parts of one crown?"""
     if min(len(first.outline), len(second.outline)) < 3:
         return False
-    evidence = [np.exp(crown_evidence(crown, crown.jaw, LOOKS)) for crown in (first, second)]
+    evidence = [np.exp(crown_evidence(crown, crown.jaw)) for crown in (first, second)]
     if float(evidence[0] @ evidence[1]) < LEAST_ALIKE:
         return False
     return _distance(first.outline, second.outline) <= GAP * min(first.width, second.width)

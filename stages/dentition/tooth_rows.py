@@ -7,7 +7,6 @@ position grows by one, more where a tooth is missing or was not found; a crown m
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -23,33 +22,15 @@ POSITIONS = 14
 NO_TOOTH = -1
 #: Log probability of a position where a person has said another.
 SAID_OTHERWISE = -60.0
+#: Least probability of any position by looks.
+LEAST_BY_LOOKS = 2e-3
+#: Costs are negative log probabilities: of each position passed over between two crowns, next to
+#: each other or apart; of a crown that is no tooth of the row; of one that is the rest of the one
+#: before, where it may be: of 80 neighbours that look like one tooth ten are.
+SKIPPED_COST, NO_TOOTH_COST, PART_COST = 3.0, 4.5, 2.1
 
 
-@dataclass(frozen=True)
-class ChainOptions:
-    """Settings of `row_probabilities`. Costs are negative log probabilities.
-
-    Attributes:
-        temper: evidence of a crown's looks counts this much, for its pixels err together.
-        floor: least probability of any position by looks.
-        skipped: cost of each position passed over between two crowns, next to each other or apart.
-        none: cost of a crown that is no tooth of the row.
-        part: cost of a crown that is the rest of the one before, where it may be: of 80 neighbours
-            that look like one tooth ten are.
-    """
-
-    temper: float = 1.0
-    floor: float = 2e-3
-    skipped: float = 3.0
-    none: float = 4.5
-    part: float = 2.1
-
-
-#: How the looks of crowns count.
-LOOKS = ChainOptions()
-
-
-def position_evidence(numbers: Mapping[int, float], jaw: Jaw, options: ChainOptions) -> Array:
+def position_evidence(numbers: Mapping[int, float], jaw: Jaw) -> Array:
     """[14] log probability of each position along the row by a crown's looks."""
     order = teeth_of(jaw)
     share = np.zeros(POSITIONS)
@@ -58,9 +39,8 @@ def position_evidence(numbers: Mapping[int, float], jaw: Jaw, options: ChainOpti
             share[order.index(permanent_of(tooth))] += probability
     if share.sum() <= 0:
         share[:] = 1.0
-    share = share / share.sum()
-    share = share**options.temper
-    return np.asarray(np.log((1 - options.floor * POSITIONS) * share / share.sum() + options.floor))
+    spread = 1 - LEAST_BY_LOOKS * POSITIONS
+    return np.asarray(np.log(spread * share / share.sum() + LEAST_BY_LOOKS))
 
 
 def number_is_said(crown: Crown) -> bool:
@@ -73,19 +53,18 @@ def believed(crown: Crown) -> Mapping[int, float]:
     return {crown.number: 1.0} if number_is_said(crown) else crown.numbers
 
 
-def crown_evidence(crown: Crown, jaw: Jaw, options: ChainOptions) -> Array:
+def crown_evidence(crown: Crown, jaw: Jaw) -> Array:
     """[14] log probability of each position; a person's word leaves no other, and none at all to
     a wisdom tooth, which stands behind the row."""
     if number_is_said(crown):
         said = np.array(teeth_of(jaw)) == permanent_of(crown.number)
         return np.where(said, 0.0, SAID_OTHERWISE)
-    return position_evidence(crown.numbers, jaw, options)
+    return position_evidence(crown.numbers, jaw)
 
 
 def row_probabilities(
-    evidence: Array, options: ChainOptions, weights: Array | None = None,
-    spacing: Array | None = None,
-) -> tuple[Array, float]:  # fmt: skip
+    evidence: Array, weights: Array | None = None, spacing: Array | None = None
+) -> Array:
     """Probabilities of each crown's position in its row.
 
     Args:
@@ -95,22 +74,21 @@ def row_probabilities(
             far they are apart.
 
     Returns:
-        [n, 15] probabilities of the positions and (last) of being no tooth of this row; and the
-        log probability of the row.
+        [n, 15] probabilities of the positions and (last) of being no tooth of this row.
     """
     count = len(evidence)
     if count == 0:
-        return np.zeros((0, POSITIONS + 1)), 0.0
+        return np.zeros((0, POSITIONS + 1))
     # A state is the last position taken, 0: none yet; p + 1: position p.
     states = POSITIONS + 1
     step = np.full((states, states), -np.inf)
     for a in range(states):
         for b in range(a + 1, states):
-            step[a, b] = 0.0 if a == 0 else -options.skipped * (b - a - 1)
+            step[a, b] = 0.0 if a == 0 else -SKIPPED_COST * (b - a - 1)
     steps = np.repeat(step[None], count, axis=0)
     if spacing is not None:
         steps[:, 1:, 1:] += spacing
-    stay = -(options.none + np.log(POSITIONS)) * (np.ones(count) if weights is None else weights)
+    stay = -(NO_TOOTH_COST + np.log(POSITIONS)) * (np.ones(count) if weights is None else weights)
     forward = np.full((count + 1, states), -np.inf)
     forward[0, 0] = 0.0
     for k in range(count):
@@ -131,11 +109,11 @@ def row_probabilities(
         result[k, POSITIONS] = np.exp(
             np.logaddexp.reduce(forward[k] + stay[k] + backward[k + 1]) - total
         )
-    return result, total
+    return result
 
 
 def best_rows(
-    evidence: Array, count: int, options: ChainOptions, wholes: Collection[int] = ()
+    evidence: Array, count: int, wholes: Collection[int] = ()
 ) -> list[tuple[float, Labels]]:
     """The most probable labellings of a row, best first.
 
@@ -148,7 +126,7 @@ def best_rows(
         (cost, labels): cost is the negative log probability; a label is a position or `NO_TOOTH`.
         Parts of one crown have the same.
     """
-    none = options.none + float(np.log(POSITIONS))
+    none = NO_TOOTH_COST + float(np.log(POSITIONS))
     partial: dict[int, list[tuple[float, Labels]]] = {-1: [(0.0, ())]}
     for k, crown in enumerate(evidence):
         following: dict[int, list[tuple[float, Labels]]] = {}
@@ -156,11 +134,11 @@ def best_rows(
             for cost, labels in rows:
                 following.setdefault(last, []).append((cost + none, (*labels, NO_TOOTH)))
                 if k - 1 in wholes and labels[-1] == last and labels[-2:-1] != (last,):
-                    more = cost + options.part - float(crown[last])
+                    more = cost + PART_COST - float(crown[last])
                     following[last].append((more, (*labels, last)))
                 for position in range(last + 1, POSITIONS):
                     skipped = 0 if last < 0 else position - last - 1
-                    more = cost + options.skipped * skipped - float(crown[position])
+                    more = cost + SKIPPED_COST * skipped - float(crown[position])
                     following.setdefault(position, []).append((more, (*labels, position)))
         partial = {last: sorted(rows)[:count] for last, rows in following.items()}
     return sorted(row for rows in partial.values() for row in rows)[:count]

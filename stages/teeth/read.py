@@ -20,12 +20,7 @@ from stages.dentition.crowns import (
     with_outlines,
 )
 from stages.dentition.far_side import far_side_apart
-from stages.dentition.tooth_rows import (
-    POSITIONS,
-    ChainOptions,
-    position_evidence,
-    row_probabilities,
-)
+from stages.dentition.tooth_rows import POSITIONS, position_evidence, row_probabilities
 from stages.teeth.instances import Found, find_crowns
 from stages.teeth.network import HEIGHT, KINDS, WIDTH, Answer, Transform, fitted, look
 from stages.teeth.numbers import looks
@@ -71,7 +66,6 @@ def read_photograph(
     image: Array32,
     valid: Bool,
     name: str,
-    options: ChainOptions | None = None,
     quarters: int = 0,
     glances: Glances | None = None,
 ) -> Reading:
@@ -81,7 +75,6 @@ def read_photograph(
         image: [H, W, 3] float32 sRGB in 0..1.
         valid: [H, W] bool: nothing is read outside.
         name: of the view.
-        options: of the numbers.
         quarters: of a turn anticlockwise that bring the photograph upright, unless it clearly looks
             otherwise.
         glances: at it, where some were taken before.
@@ -104,12 +97,10 @@ def read_photograph(
     if not crowns:
         return Reading(Dentition(name, size, "none"), kinds, apart)
     likely = max(kinds, key=lambda k: kinds[k])
-    chain = options or ChainOptions()
-    dentition = numbered(dentition_of(_outlines(crowns), name, size, likely), chain)
+    dentition = numbered(dentition_of(_outlines(crowns), name, size, likely))
     near, behind = far_side_apart(dentition)
     if behind:
-        dentition = with_outlines(dentition, [outline_of(crown) for crown in near])
-        dentition = numbered(dentition, chain)
+        dentition = numbered(with_outlines(dentition, [outline_of(crown) for crown in near]))
     margin = _BESIDE_FAR_SIDE * dentition.band_height
     jaws = on_jaws([first, answer], size, [crown.outline for crown in behind], margin)
     return Reading(replace(dentition, on_jaws=jaws), kinds, apart)
@@ -216,7 +207,7 @@ def _outlines(crowns: list[Found]) -> list[Outline]:
     ]
 
 
-def numbered(dentition: Dentition, options: ChainOptions) -> Dentition:
+def numbered(dentition: Dentition) -> Dentition:
     """The dentition with each crown's most probable number and its doubt, by this photograph alone.
 
     Numbers that a person has said (doubt 0) stay.
@@ -224,10 +215,8 @@ def numbered(dentition: Dentition, options: ChainOptions) -> Dentition:
     rows: dict[Jaw, tuple[Crown, ...]] = {}
     for jaw in JAWS:
         crowns = dentition.crowns(jaw)
-        evidence = np.array(
-            [position_evidence(crown.numbers, jaw, options) for crown in crowns]
-        ).reshape(-1, POSITIONS)
-        shares, _ = row_probabilities(evidence, options)
+        evidence = [position_evidence(crown.numbers, jaw) for crown in crowns]
+        shares = row_probabilities(np.array(evidence).reshape(-1, POSITIONS))
         rows[jaw] = tuple(
             crown if crown.doubt == 0 else _with_number(crown, jaw, share)
             for crown, share in zip(crowns, shares, strict=True)

@@ -30,7 +30,6 @@ from pipeline.artifacts.views import View, Views
 from pipeline.geometry.rigid import angle_between
 from stages.dentition.crowns import Outline, dentition_of, outline_of, with_outlines
 from stages.dentition.far_side import far_side
-from stages.dentition.tooth_rows import LOOKS
 from stages.teeth.read import numbered
 from tests.stages.dental_arch_scene import pieces
 
@@ -90,7 +89,7 @@ class Case:
 
 def _near_side(dentition: Dentition) -> Dentition:
     """Without what is seen across the mouth, which the reader leaves out as well."""
-    numbers = numbered(dentition, LOOKS)
+    numbers = numbered(dentition)
     kept = [
         outline_of(crown)
         for jaw in JAWS

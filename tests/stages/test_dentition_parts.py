@@ -13,7 +13,13 @@ from stages.dentition.corrections import area, split_polygon
 from stages.dentition.crowns import dentition_of, outline_of
 from stages.dentition.parts import joined_parts, perhaps_one
 from stages.dentition.row_edits import is_ordered, joining_edits, row_edits
-from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS, ChainOptions, best_rows
+from stages.dentition.tooth_rows import (
+    NO_TOOTH,
+    PART_COST,
+    POSITIONS,
+    SKIPPED_COST,
+    best_rows,
+)
 from stages.init.dental.mirror_images import Turned
 from stages.init.dental.numbering.arch import ArchOptions, fit_arch
 from stages.init.dental.numbering.hypotheses import row_defects
@@ -105,7 +111,6 @@ def test_only_two_neighbours_are_parts_of_one_crown() -> None:
 
 @pytest.mark.parametrize(("seed", "count", "wholes"), [(0, 3, {0}), (1, 3, {0, 1}), (2, 4, {1})])
 def test_best_rows_with_parts_are_the_best_of_all(seed: int, count: int, wholes: set[int]) -> None:
-    options = ChainOptions()
     crowns = np.log(np.random.default_rng(seed).dirichlet(np.full(POSITIONS, 0.4), count) + 1e-3)
     crowns[1] = crowns[0] + 0.1
     rows = []
@@ -113,10 +118,10 @@ def test_best_rows_with_parts_are_the_best_of_all(seed: int, count: int, wholes:
         if is_ordered(labels, wholes):
             parts = sum(a == b for a, b in pairwise(labels))
             skipped = sum(max(b - a - 1, 0) for a, b in pairwise(labels))
-            cost = options.part * parts + options.skipped * skipped
+            cost = PART_COST * parts + SKIPPED_COST * skipped
             rows.append((cost - crowns[np.arange(count), labels].sum(), labels))
     wanted = sorted(rows)[:8]
-    found = [row for row in best_rows(crowns, 400, options, wholes) if NO_TOOTH not in row[1]][:8]
+    found = [row for row in best_rows(crowns, 400, wholes) if NO_TOOTH not in row[1]][:8]
     assert [labels for _, labels in found] == [labels for _, labels in wanted]
     np.testing.assert_allclose([c for c, _ in found], [c for c, _ in wanted], rtol=1e-12)
 

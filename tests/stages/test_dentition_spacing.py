@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.artifacts.dental.fdi import JAWS, teeth_of
 from stages.dentition.spacing import spacing_cost, spacing_evidence, textbook_distances, unit_of
-from stages.dentition.tooth_rows import POSITIONS, ChainOptions, row_probabilities
+from stages.dentition.tooth_rows import POSITIONS, row_probabilities
 
 UNIT = 0.01
 
@@ -51,10 +51,9 @@ def test_a_gap_is_a_missing_tooth(share: float) -> None:
     looks = looks_of(positions, -1, share)
     looks[:5] = looks_of(positions[:5], 1, 0.05)
     places = places_of(positions)
-    options = ChainOptions()
-    blind, _ = row_probabilities(looks, options)
+    blind = row_probabilities(looks)
     assert blind.argmax(1).tolist() != positions
-    told, _ = row_probabilities(looks, options, spacing=spacing_evidence("upper", places, UNIT))
+    told = row_probabilities(looks, spacing=spacing_evidence("upper", places, UNIT))
     assert told.argmax(1).tolist() == positions
 
 
@@ -63,7 +62,7 @@ def test_where_a_gap_has_closed_looks_decide() -> None:
     places = places_of([2, 3, 4, 5, 6, 7, 8])
     looks = 3 * looks_of(positions, -1, 0.01)  # as three photographs see it
     spacing = spacing_evidence("upper", places, UNIT)
-    told, _ = row_probabilities(looks, ChainOptions(), spacing=spacing)
+    told = row_probabilities(looks, spacing=spacing)
     assert told.argmax(1).tolist() == positions
 
 
@@ -71,8 +70,8 @@ def test_spaces_of_the_textbook_change_nothing() -> None:
     positions = list(range(1, 12))
     looks = looks_of(positions, 1, 0.2)
     spacing = spacing_evidence("upper", places_of(positions, 1.1), UNIT)
-    blind, _ = row_probabilities(looks, ChainOptions())
-    told, _ = row_probabilities(looks, ChainOptions(), spacing=spacing)
+    blind = row_probabilities(looks)
+    told = row_probabilities(looks, spacing=spacing)
     assert told.argmax(1).tolist() == blind.argmax(1).tolist() == positions
 
 

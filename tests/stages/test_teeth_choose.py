@@ -9,7 +9,6 @@ import pytest
 
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.crowns import dentition_of
-from stages.dentition.tooth_rows import ChainOptions
 from stages.teeth.choose import ChoiceOptions, choose, chroma, layout_distance
 from stages.teeth.read import Reading, numbered, row_extent
 from tests.stages.crowns_case import SIZE, mouth
@@ -179,7 +178,7 @@ def test_numbers_by_one_photograph_alone() -> None:
     upper[4] = replace(upper[4], numbers={61: 0.7, 21: 0.3})
     said = replace(found.lower[1], number=38, doubt=0.0)
     lower = (found.lower[0], said, *found.lower[2:])
-    after = numbered(replace(found, upper=tuple(upper), lower=lower), ChainOptions())
+    after = numbered(replace(found, upper=tuple(upper), lower=lower))
     assert [crown.number for crown in after.upper] == [14, 13, 12, 11, 61, 22, 23]
     assert [crown.number for crown in after.lower] == [43, 38, 41, 31, 32, 33]
     assert after.lower[1].doubt == 0

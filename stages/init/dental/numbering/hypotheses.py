@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import is_upper
-from stages.dentition.tooth_rows import LOOKS, NO_TOOTH, Labels, best_rows
+from stages.dentition.tooth_rows import NO_TOOTH, NO_TOOTH_COST, Labels, best_rows
 from stages.init.dental.cameras.bundle import (
     NO_MATCHES,
     Adjusted,
@@ -300,7 +300,7 @@ def looks_cost(row: SeenRow, labels: Labels) -> float:
     total = 0.0
     for looks, score, label in zip(row.looks, row.scores, labels, strict=True):
         # A crown that is hardly one may be none at less cost.
-        total -= float(looks[label]) if label != NO_TOOTH else -LOOKS.none * float(score)
+        total -= float(looks[label]) if label != NO_TOOTH else -NO_TOOTH_COST * float(score)
     return 2 * total
 
 
@@ -310,7 +310,7 @@ def row_pairs(rows: tuple[SeenRow, SeenRow], count: int) -> list[ViewLabels]:
     Where it allows none, the looks of one row are wrong: the likeliest, for the others to correct.
     """
     upper, lower = rows
-    best = [best_rows(row.looks, count, LOOKS, row.said_wholes) for row in rows]
+    best = [best_rows(row.looks, count, row.said_wholes) for row in rows]
     likeliest = sorted((cost + other, (a, b)) for (cost, a), (other, b) in product(*best))
     pairs = []
     for _, (a, b) in likeliest:

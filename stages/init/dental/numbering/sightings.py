@@ -17,13 +17,7 @@ from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, Point
 from stages.dentition.crowns import TIP_FLATNESS, ZENITH_FLATNESS, outermost
 from stages.dentition.parts import perhaps_one
-from stages.dentition.tooth_rows import (
-    LOOKS,
-    NO_TOOTH,
-    SAID_OTHERWISE,
-    Labels,
-    crown_evidence,
-)
+from stages.dentition.tooth_rows import NO_TOOTH, SAID_OTHERWISE, Labels, crown_evidence
 from stages.init.dental.cameras.bundle import Sightings
 from stages.init.dental.template import (
     EMBRASURE,
@@ -188,7 +182,7 @@ def seen_rows(dentition: Dentition) -> tuple[SeenRow, SeenRow]:
                 embrasures_left=collect([c.embrasure_left for c in crowns]) if upper else hidden,
                 embrasures_right=collect([c.embrasure_right for c in crowns]) if upper else hidden,
                 doubtful=doubtful,
-                looks=np.array([crown_evidence(crown, jaw, LOOKS) for crown in crowns]).reshape(
+                looks=np.array([crown_evidence(crown, jaw) for crown in crowns]).reshape(
                     -1, POSITIONS
                 ),
                 scores=np.array([crown.score for crown in crowns], np.float64),
