@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.corrections import SIDES, area, says_side
+from stages.teeth.config import TeethConfig
 from stages.teeth.read import Reading, row_extent
 
 Array32 = npt.NDArray[np.float32]
@@ -25,31 +26,17 @@ _OCCLUSAL = {
 #: (Sides of 12 generated ones: .77 at most. Of 45 photographs with the jaws apart the outlines of 8
 #: meet, tilted or touching: .86 at least.)
 _APART, _SURELY_APART = 0.5, 0.8
+#: Or if the gap between them (`Dentition.jaws_apart`) is larger.
+_APART_GAP = 0.3
 #: Photographs are compared in numbers that so many crowns have in common.
 _COMMON_CROWNS = 5
 #: Long side to which sharpness is compared.
 _SHARPNESS_SIDE = 512
 
 
-@dataclass(frozen=True)
-class ChoiceOptions:
-    """Settings of `choose`: those of `config.TeethConfig`, and one more.
-
-    Attributes:
-        apart_gap: the jaws are apart where the gap between them (`Dentition.jaws_apart`) is larger.
-    """
-
-    least_crowns: int = 5
-    least_extent: float = 0.3
-    least_colour: float = 4.0
-    same_view: float = 0.02
-    least_score: float = 0.9
-    apart_gap: float = 0.3
-
-
 def choose(
     readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
-    options: ChoiceOptions,
+    config: TeethConfig,
 ) -> list[Dentition]:  # fmt: skip
     """Set aside, with a reason each, the photographs that tell nothing of the closed bite.
 
@@ -62,9 +49,9 @@ def choose(
         The dentitions, `set_aside` filled in.
     """
     reasons = [
-        _unusable(reading, image, options) for reading, image in zip(readings, images, strict=True)
+        _unusable(reading, image, config) for reading, image in zip(readings, images, strict=True)
     ]
-    for k, reason in _repeated(readings, images, names, reasons, options).items():
+    for k, reason in _repeated(readings, images, names, reasons, config).items():
         reasons[k] = reason
     return [
         replace(reading.dentition, set_aside=reason)
@@ -72,25 +59,25 @@ def choose(
     ]
 
 
-def _unusable(reading: Reading, image: Array32, options: ChoiceOptions) -> str:
+def _unusable(reading: Reading, image: Array32, config: TeethConfig) -> str:
     """Why a photograph by itself can't be used; empty: it can."""
     dentition = reading.dentition
-    if chroma(image) < options.least_colour:
+    if chroma(image) < config.least_colour:
         return "it has no colour: an X-ray, or not a photograph"
-    if len(dentition.all_crowns) < options.least_crowns:
+    if len(dentition.all_crowns) < config.least_crowns:
         return f"no row of teeth was found in it ({len(dentition.all_crowns)} crowns)"
-    if usual_score(dentition) < options.least_score:
+    if usual_score(dentition) < config.least_score:
         return "what was found in it hardly looks like teeth"
-    if row_extent(dentition) < options.least_extent:
+    if row_extent(dentition) < config.least_extent:
         return "the teeth are too small in it: a face, or taken from too far away"
     occlusal = {kind: reading.kinds[kind] for kind in _OCCLUSAL}
     jaw = max(occlusal, key=lambda kind: occlusal[kind])
     rows = (len(dentition.upper), len(dentition.lower))
     if sum(occlusal.values()) > 0.5:
         return f"it shows {_OCCLUSAL[jaw]}"
-    if min(rows) <= 1 and max(rows) >= options.least_crowns and reading.kinds["other"] > 0.5:
+    if min(rows) <= 1 and max(rows) >= config.least_crowns and reading.kinds["other"] > 0.5:
         return "it shows one jaw only"
-    if reading.apart > _least_apart(dentition) or dentition.jaws_apart > options.apart_gap:
+    if reading.apart > _least_apart(dentition) or dentition.jaws_apart > _APART_GAP:
         return "the jaws are apart in it"
     return ""
 
@@ -122,7 +109,7 @@ def chroma(image: Array32) -> float:
 
 def _repeated(
     readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
-    reasons: Sequence[str], options: ChoiceOptions,
+    reasons: Sequence[str], config: TeethConfig,
 ) -> dict[int, str]:  # fmt: skip
     """Photographs that show what a better one shows too -> why they are set aside."""
     usable = [k for k, reason in enumerate(reasons) if not reason]
@@ -137,7 +124,7 @@ def _repeated(
             if SIDES.get(says_side(names[k])) == says_side(names[other]) != "":
                 continue  # one is a mirror image, and of another side
             off = layout_distance(readings[k].dentition, readings[other].dentition)
-            if off is not None and off < options.same_view:
+            if off is not None and off < config.same_view:
                 result[k] = f"it shows the same as {names[other]}, which is clearer"
                 break
     return result

@@ -237,6 +237,7 @@ def _with_number(crown: Crown, jaw: Jaw, share: npt.NDArray[np.float64]) -> Crow
 
 
 def row_extent(dentition: Dentition) -> float:
-    """Width of the teeth over that of the photograph."""
+    """How far the crowns reach along or across a photograph, whichever is more, over its long
+    side."""
     centres = np.array([centroid(crown.outline) for crown in dentition.all_crowns])
     return float(np.ptp(centres, axis=0).max() / max(dentition.size)) if len(centres) else 0.0

@@ -36,7 +36,7 @@ class TeethStage(Stage):
         from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.dentition.working import resized_dentition, working_view
-        from stages.teeth.choose import ChoiceOptions, choose
+        from stages.teeth.choose import choose
         from stages.teeth.reader import PhotographReader, evenly
 
         config: TeethConfig = context.config
@@ -59,14 +59,10 @@ class TeethStage(Stage):
             return
         readings = reader.read(context.progress, places)
         read = [asked[place] for place in places]
-        options = ChoiceOptions(
-            config.least_crowns, config.least_extent, config.least_colour, config.same_view,
-            config.least_score,
-        )  # fmt: skip
         names = [views[k].source_name or views[k].name for k in read]
         images = [working[place].image for place in places]
         chosen = (
-            choose(readings, images, names, options)
+            choose(readings, images, names, config)
             if config.set_aside
             else [reading.dentition for reading in readings]
         )
