@@ -89,7 +89,6 @@ class Dentition:
         band_height: pixels from the upper to the lower gum line (median).
         jaws_apart: 0..1, how far the jaws are certainly not in contact.
         set_aside: why the photograph takes no part in the reconstruction; empty: it does.
-        doubts: sentences for the user about what is not as expected; empty where all is well.
         on_jaws: [K, 2] polygons around what is tooth or gum, and around holes in that; the rest is
             lip, cheek, or what holds them. None: nobody told.
         mirrored: True: the photograph is a mirror image, and what is said here is of the picture
@@ -105,7 +104,6 @@ class Dentition:
     band_height: float = 0.0
     jaws_apart: float = 0.0
     set_aside: str = ""
-    doubts: tuple[str, ...] = ()
     on_jaws: tuple[npt.NDArray[np.float64], ...] | None = None
     mirrored: bool | None = None
 
@@ -234,7 +232,6 @@ def _view_entry(view: Dentition) -> dict[str, Any]:
         "band_height": round(float(view.band_height), _DECIMALS),
         "jaws_apart": round(float(view.jaws_apart), _PROBABILITY_DECIMALS),
         "set_aside": view.set_aside,
-        "doubts": list(view.doubts),
         "mirrored": view.mirrored,
         "on_jaws": None
         if view.on_jaws is None
@@ -279,7 +276,6 @@ def _view(entry: Mapping[str, Any]) -> Dentition:
         band_height=entry["band_height"],
         jaws_apart=entry["jaws_apart"],
         set_aside=entry["set_aside"],
-        doubts=tuple(entry["doubts"]),
         on_jaws=None
         if entry.get("on_jaws") is None
         else tuple(np.array(polygon, np.float64) for polygon in entry["on_jaws"]),

@@ -69,17 +69,16 @@ def dentition_of(
     kind: str,
     roll: float | None = None,
     set_aside: str = "",
-    doubts: tuple[str, ...] = (),
 ) -> Dentition:
     """Put the crowns of a photograph in order and find their landmarks.
 
     Args:
         outlines: of the crowns.
-        name, size, kind, set_aside, doubts: as in `Dentition`.
+        name, size, kind, set_aside: as in `Dentition`.
         roll: radians by which the rows are turned clockwise; None: found from the outlines.
     """
     good = [outline for outline in outlines if len(outline.polygon) >= 3]
-    base = Dentition(name, size, kind, set_aside=set_aside, doubts=doubts)
+    base = Dentition(name, size, kind, set_aside=set_aside)
     if not good:
         return base
     turn = row_roll(good) if roll is None else roll
@@ -108,10 +107,8 @@ def dentition_of(
 
 def with_outlines(dentition: Dentition, outlines: Sequence[Outline]) -> Dentition:
     """A photograph whose crowns have become others: all else is kept, landmarks are found again."""
-    made = dentition_of(
-        outlines, dentition.name, dentition.size, dentition.kind, roll=dentition.roll,
-        set_aside=dentition.set_aside, doubts=dentition.doubts,
-    )  # fmt: skip
+    name, size, kind = dentition.name, dentition.size, dentition.kind
+    made = dentition_of(outlines, name, size, kind, dentition.roll, dentition.set_aside)
     return replace(made, on_jaws=dentition.on_jaws, mirrored=dentition.mirrored)
 
 

@@ -98,8 +98,7 @@ def teeth(case: Case) -> Iterator[Section]:
             title = labels.get(view.name, view.name)
             numbered = sum(bool(crown.number) for crown in view.all_crowns)
             said = f"{title}: {view.kind}, {numbered} of {len(view.all_crowns)} teeth numbered"
-            caption = ". ".join([said, *(doubt.rstrip(".") for doubt in view.doubts)]) + "."
-            drawn.append(picture(image, said, caption, 900))
+            drawn.append(picture(image, said, f"{said}.", 900))
     told = Text("What was taken for which tooth, by FDI number.")
     if (case.workspace / CHECK).is_file() and not case.nameless:
         told = Text(f"{told.text} Something is wrong?", link=(CHECK, "Put it right", "."))

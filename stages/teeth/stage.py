@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 18
+    version = 19
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)

@@ -112,7 +112,7 @@ def dentition() -> Dentition:
     lower = (crown(box(22, 40, 20, 25), "lower", cut_right=True, numbers={85: 1.0}),)
     return Dentition(
         "000", (WIDTH, HEIGHT), "front", upper, lower, np.radians(12.5), 55.25, 0.125,
-        doubts=("it looks mirrored",), mirrored=True,
+        mirrored=True,
     )  # fmt: skip
 
 

@@ -182,8 +182,8 @@ def test_crowns_at_the_border_and_weak_ones_are_doubtful() -> None:
 def test_bad_outlines_are_left_out_and_nothing_is_a_dentition() -> None:
     line = Outline(np.zeros((2, 2)), "upper")
     assert read([line]).all_crowns == ()
-    empty = dentition_of([], "a", SIZE, "none", set_aside="why", doubts=("b",))
-    assert (empty.set_aside, empty.doubts, empty.band_height) == ("why", ("b",), 0.0)
+    empty = dentition_of([], "a", SIZE, "none", set_aside="why")
+    assert (empty.set_aside, empty.band_height) == ("why", 0.0)
     assert len(read([*mouth(), line]).all_crowns) == len(UPPER_WIDTHS) + len(LOWER_WIDTHS)
     single = read([mouth()[2]]).upper[0]
     assert single.papilla_left is None
@@ -192,10 +192,9 @@ def test_bad_outlines_are_left_out_and_nothing_is_a_dentition() -> None:
 
 
 def test_outlines_lead_to_the_same_dentition_again() -> None:
-    first = read(mouth(33.0), set_aside="why", doubts=("odd",))
+    first = read(mouth(33.0), set_aside="why")
     again = dentition_of(
         [outline_of(crown) for crown in first.all_crowns], "000", SIZE, "front", first.roll, "why",
-        ("odd",),
     )  # fmt: skip
     assert as_text(first) == as_text(again)
     crown = first.upper[0]
@@ -222,13 +221,13 @@ def numbered(outlines: list[Outline]) -> list[Outline]:
 def test_teeth_of_a_mirror_image(degrees: float) -> None:
     """As they would have been read from the picture turned over."""
     outlines = numbered(mouth(degrees, bump=0.4, gaps={3: 20.0}))
-    found = read(outlines, set_aside="why", doubts=("odd",))
+    found = read(outlines, set_aside="why")
     over = mirrored_dentition(found)
     turned_over = [replace(o, polygon=o.polygon * [-1, 1] + [SIZE[0], 0]) for o in outlines]
     expected = read(turned_over)
     assert np.sin(over.roll - expected.roll) == pytest.approx(0, abs=1e-9)
     assert (over.band_height, over.jaws_apart) == (found.band_height, found.jaws_apart)
-    assert (over.set_aside, over.doubts, over.mirrored) == ("why", ("odd",), True)
+    assert (over.set_aside, over.mirrored) == ("why", True)
     assert [crown.number for crown in over.upper] == [53, 12, 11, 21, 12, 23, 24]
     assert [crown.number for crown in over.lower] == [42, 41, 31, 42, 33, 34]
     assert [crown.doubt for crown in over.upper] == [0.3, 0.3, 0.3, 0.3, 0, 0.3, 0.3]

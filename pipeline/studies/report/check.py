@@ -155,7 +155,6 @@ def _photograph(
         "roll": round(float(seen.roll), 4),
         "kind": seen.kind,
         "aside": seen.set_aside or ("" if seen.all_crowns else _NOTHING[seen.kind == UNREAD]),
-        "doubts": list(seen.doubts),
         "crowns": [crown for crown in crowns if crown["outline"] not in gone],
         "removed": removed,
         "earlier": _entries(earlier, before),

@@ -86,7 +86,6 @@ const useIt = (photo, use) => {
   say(`${photo.name} is ${use ? "used" : "left out"}.`);
 };
 
-const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1).replace(/\.$/, "")}.`;
 const marks = (photo, crown, wrong) => [`q${quadrantOf(crown.number)}`,
   isUnsure(crown, data.doubtful) ? "unsure" : "", wrong.has(crown.id) ? "wrong" : "",
   chosen?.id === crown.id ? "chosen" : ""].join(" ");
@@ -168,8 +167,7 @@ const drawCard = (photo) => {
   drawCrowns(photo, card);
   card.notes.replaceChildren(
     ...(photo.mirrored ? [make("p", {}, "A mirror image: shown turned over.")] : []),
-    ...problems.map((problem) => make("p", { class: "wrong" }, `Can't be: ${problem.text}.`)),
-    ...photo.doubts.map((text) => make("p", { class: "doubt" }, sentence(text))));
+    ...problems.map((problem) => make("p", { class: "wrong" }, `Can't be: ${problem.text}.`)));
   const first = photo.crowns.some((crown) => crown.id === chosen?.id) ? null
     : [...rowOf(photo, "upper"), ...rowOf(photo, "lower")][0];
   const rows = ["upper", "lower"].map((jaw) => {
