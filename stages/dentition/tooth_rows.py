@@ -17,7 +17,8 @@ from pipeline.artifacts.teeth import Crown
 Array = npt.NDArray[np.float64]
 Labels = tuple[int, ...]
 
-#: Positions along a row, patient's right to left, and the label of a crown that is no tooth.
+#: Positions along a row, patient's right to left, the midline between 6 and 7; and the label of a
+#: crown that is no tooth.
 POSITIONS = 14
 NO_TOOTH = -1
 #: Log probability of a position where a person has said another.

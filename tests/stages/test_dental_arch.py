@@ -10,6 +10,7 @@ import pytest
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
+from stages.dentition.tooth_rows import POSITIONS
 from stages.init.dental.cameras import kernels
 from stages.init.dental.cameras.bundle import nominal_rotation
 from stages.init.dental.numbering.arch import ArchOptions
@@ -17,7 +18,6 @@ from stages.init.dental.numbering.primary import ALL_PRIMARY
 from stages.init.dental.template import (
     EMBRASURE,
     PAPILLA,
-    POSITIONS,
     TIP,
     ZENITH,
     is_lower_landmark,

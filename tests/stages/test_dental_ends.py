@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.dental.fdi import JAWS
-from stages.dentition.tooth_rows import NO_TOOTH
+from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS
 from stages.init.dental.numbering.ends import MOST_COST, end_labels, ends_cost, hidden_at_ends
 from stages.init.dental.numbering.hypotheses import row_defects, row_pairs
 from stages.init.dental.numbering.sightings import SeenRow
-from stages.init.dental.template import LANDMARKS_A_JAW, PAPILLA, POSITIONS, ZENITH
+from stages.init.dental.template import LANDMARKS_A_JAW, PAPILLA, ZENITH
 
 #: Teeth are as wide as their position says, pixels: each a little wider than the one before.
 EDGES = np.cumsum([0, *range(10, 10 + POSITIONS)])

@@ -98,9 +98,8 @@ def labelled_teeth(context: StageContext, views: Views) -> Teeth:
             "`init`, as in --stages teeth,init."
         )
     read: Teeth = context.load("teeth")
-    for label, path in context.sources.items():
-        if label == CORRECTIONS:
-            read = apply_corrections(read, views, read_corrections(path))
+    if CORRECTIONS in context.sources:
+        read = apply_corrections(read, views, read_corrections(context.sources[CORRECTIONS]))
     said = context.config.dental.labels
     if not isinstance(said, str) and said:
         photographs: dict[str, PhotoCorrection] = {}

@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import PRIMARY_PLACES, Jaw, is_upper, teeth_of
+from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, Jaw, is_upper, teeth_of
 from pipeline.artifacts.dental.sizes import HEIGHTS, PRIMARY_HEIGHTS, PRIMARY_WIDTHS, WIDTHS
+from stages.dentition.tooth_rows import POSITIONS
 from stages.init.dental.landmarks import Landmark
 
 Array = npt.NDArray[np.float64]
@@ -37,8 +38,6 @@ GUM_STEPS = ((4.0, 0.8), (9.0, -0.5))
 TEETH_A_SIDE = 7
 #: The curve goes on so far (mm) as a straight line.
 STRAIGHT_ON = 30.0
-#: Positions along a row, patient's right to left; the midline is between 6 and 7.
-POSITIONS = 14
 
 
 def tooth_at(jaw: Jaw, position: int) -> int:
@@ -55,8 +54,7 @@ def position_of(tooth: int) -> int:
 def landmark_names() -> tuple[Landmark, ...]:
     """All landmarks of the model, jaw by jaw: zeniths, tips, papillae, embrasures by position."""
     names: list[Landmark] = []
-    jaws: tuple[Jaw, Jaw] = ("upper", "lower")
-    for jaw in jaws:
+    for jaw in JAWS:
         teeth = teeth_of(jaw)
         names += [Landmark("zenith", tooth) for tooth in teeth]
         names += [Landmark("tip", tooth) for tooth in teeth]
@@ -183,8 +181,7 @@ def textbook_arch(
         [L, 3] float64, mm, arch frame. Not to be written to (it is cached).
     """
     result = np.empty((2 * LANDMARKS_A_JAW, 3))
-    jaws: tuple[Jaw, Jaw] = ("upper", "lower")
-    for jaw in jaws:
+    for jaw in JAWS:
         for side in (1, -1):
             absent, milk = (_side_of(teeth, jaw, side) for teeth in (closed_gaps, primary))
             half = _half_jaw(jaw, absent, milk) * np.array([side, 1, 1])

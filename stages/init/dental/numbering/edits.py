@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import JAWS, teeth_of
 from stages.dentition.row_edits import bounded, row_edits, shifted
-from stages.dentition.tooth_rows import Labels
+from stages.dentition.tooth_rows import POSITIONS, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.ends import end_labels, ends_cost
@@ -22,7 +22,7 @@ from stages.init.dental.numbering.hypotheses import (
     Scorer,
     ViewLabels,
 )
-from stages.init.dental.template import POSITIONS, position_of, tooth_at
+from stages.init.dental.template import position_of, tooth_at
 
 Array = npt.NDArray[np.float64]
 Fixed = dict[tuple[int, int, int], int]

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from pipeline.artifacts.dental.fdi import Jaw
-from stages.dentition.tooth_rows import NO_TOOTH, Labels
+from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS, Labels
 from stages.init.dental.cameras.bundle import Adjusted
 from stages.init.dental.numbering.sightings import SeenRow
-from stages.init.dental.template import PAPILLA, POSITIONS, landmark_index
+from stages.init.dental.template import PAPILLA, landmark_index
 
 #: How far a crown reaches beyond its tooth's papillae, towards the row and outward, and standard
 #: deviations of that, as shares of the band of teeth. Of rows of twelve patients whose last crown

@@ -16,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.dental.fdi import is_upper
-from stages.dentition.tooth_rows import NO_TOOTH, NO_TOOTH_COST, Labels, best_rows
+from stages.dentition.tooth_rows import (
+    NO_TOOTH,
+    NO_TOOTH_COST,
+    POSITIONS,
+    Labels,
+    best_rows,
+)
 from stages.init.dental.cameras.bundle import (
     NO_MATCHES,
     Adjusted,
@@ -30,7 +36,7 @@ from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.ends import ends_cost, hidden_at_ends
 from stages.init.dental.numbering.sightings import SeenRow, SightingCache
-from stages.init.dental.template import POSITIONS, position_of, textbook_arch
+from stages.init.dental.template import position_of, textbook_arch
 
 Array = npt.NDArray[np.float64]
 ViewLabels = tuple[Labels, Labels]

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.crowns import mirrored_dentition
-from stages.dentition.tooth_rows import NO_TOOTH
+from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS
 from stages.init.dental.numbering.hypotheses import (
     Labelling,
     Scored,
@@ -19,7 +19,6 @@ from stages.init.dental.numbering.hypotheses import (
     ViewLabels,
 )
 from stages.init.dental.numbering.sightings import seen_rows
-from stages.init.dental.template import POSITIONS
 
 #: Twice the log Bayes factor above which a photograph is called a mirror image (some per cent of
 #: photographs are), and above which it may be one. Of the most symmetric of twelve patients it is

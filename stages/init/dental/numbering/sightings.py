@@ -17,12 +17,17 @@ from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition, Point
 from stages.dentition.crowns import TIP_FLATNESS, ZENITH_FLATNESS, outermost
 from stages.dentition.parts import perhaps_one
-from stages.dentition.tooth_rows import NO_TOOTH, SAID_OTHERWISE, Labels, crown_evidence
+from stages.dentition.tooth_rows import (
+    NO_TOOTH,
+    POSITIONS,
+    SAID_OTHERWISE,
+    Labels,
+    crown_evidence,
+)
 from stages.init.dental.cameras.bundle import Sightings
 from stages.init.dental.template import (
     EMBRASURE,
     PAPILLA,
-    POSITIONS,
     TIP,
     ZENITH,
     facing_yaws,
