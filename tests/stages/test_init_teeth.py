@@ -7,12 +7,13 @@ import pytest
 
 from pipeline.artifacts.dental.fdi import is_upper
 from pipeline.artifacts.space.scale import Scale
-from pipeline.artifacts.teeth import Teeth
+from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
+from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import as_sentence, with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths
 from stages.init.stage import InitStage
@@ -168,6 +169,12 @@ def test_teeth_that_were_not_read_are_asked_for(tmp_path):
         InitStage().run(context)
 
 
+def test_photographs_that_were_not_read_are_not_said_to_show_no_teeth(tmp_path, monkeypatch):
+    unread = Teeth(tuple(Dentition(f"{k:03d}", SIZE[::-1], UNREAD) for k in range(3)))
+    with pytest.raises(ReconstructionError, match="None of these photographs was read"):
+        run(tmp_path, monkeypatch, found_teeth(), unread)
+
+
 def test_a_refusal_brings_the_teeth_of_all_photographs_with_it(tmp_path, monkeypatch):
     one = with_numbers(read_teeth().views[0], found_teeth().fit.views[0], found_teeth().fit)
     refused = ReconstructionError("The teeth are odd.", {}, {"teeth": Teeth((one,))})
@@ -191,7 +198,7 @@ def test_labels_given_as_settings_are_of_the_photograph_as_it_was_taken(tmp_path
         config = InitConfig(method="dental", dental={"labels": labels})
         inputs = {"views": views, "teeth": read_teeth()}
         context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
-        return place.labelled_teeth(context, views)
+        return labelled_teeth(context, views)
 
     (crown,) = [c for c in said().views[0].all_crowns if c.doubt == 0]
     assert (crown.number, crown.jaw) == (14, "upper")

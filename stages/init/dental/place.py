@@ -20,7 +20,7 @@ from pipeline.stage import StageContext
 from stages.dentition.corrections import LEFT_OUT, SIDES, says_side
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.read import labelled_teeth, set_aside_reasons, turned_as_said
+from stages.init.dental.read import set_aside_reasons, teeth_to_place_by, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths
 from stages.init.dental.surface.options import SurfaceOptions
@@ -45,7 +45,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
         RequestError: the settings of `init.dental` don't fit the photographs.
     """
     config: InitConfig = context.config
-    read = labelled_teeth(context, views)
+    read = teeth_to_place_by(context, views)
     given, views = views, turned_as_said(context, views)
     dentitions = chosen_dentitions(read, views, ordered=config.dental.order is not None)
     names = [photo_name(view) for view in views.views]

@@ -33,7 +33,7 @@ from stages.init.dental.place import (
     surface_options,
     tooth_counts,
 )
-from stages.init.dental.read import labelled_teeth
+from stages.init.dental.read import teeth_to_place_by
 from stages.init.dental.reconstruct import (
     PlacedTeeth,
     Progress,
@@ -161,7 +161,7 @@ class HeldTeeth:
 def held_teeth(context: StageContext, views: Views, cameras: Sequence[Camera]) -> HeldTeeth:
     """The teeth that were read in photographs whose cameras stay."""
     config: InitConfig = context.config
-    by_name = labelled_teeth(context, views).by_name()
+    by_name = teeth_to_place_by(context, views).by_name()
     centred = [centre_view(view, camera) for view, camera in zip(views.views, cameras, strict=True)]
     dentitions = [
         moved(by_name[view.name], found)

@@ -12,9 +12,9 @@ from pipeline.artifacts.dental.corrections import (
     PhotoCorrection,
     read_corrections,
 )
-from pipeline.artifacts.teeth import Teeth
+from pipeline.artifacts.teeth import UNREAD, Teeth
 from pipeline.artifacts.views import Views
-from pipeline.errors import RequestError
+from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
 from stages.dentition.corrections import LEFT_OUT, apply_corrections
 from stages.init.place import photo_name
@@ -84,6 +84,21 @@ def _some(names: Sequence[str]) -> str:
     """Names for a sentence: frames of a film are many."""
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return ", ".join(names[:MOST_NAMED]) + more
+
+
+def teeth_to_place_by(context: StageContext, views: Views) -> Teeth:
+    """As `labelled_teeth`, where nothing can be done without teeth.
+
+    Raises:
+        ReconstructionError: no photograph was read.
+    """
+    teeth = labelled_teeth(context, views)
+    if all(seen.kind == UNREAD for seen in teeth.views):
+        raise ReconstructionError(
+            "None of these photographs was read: teeth.method=none reads none, auto none where it "
+            "sees hardly any teeth at a first look. --set teeth.method=reader reads every one."
+        )
+    return teeth
 
 
 def labelled_teeth(context: StageContext, views: Views) -> Teeth:
