@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.corrections import CORRECTIONS
-from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
@@ -87,6 +87,11 @@ def test_what_was_set_aside_is_named_and_taken_in_when_a_person_says_so(
         ReconstructionError, match=r"1 of 8 do \(p0.jpg, p1.jpg, p2.jpg and 4 more: "
     ):
         auto(tmp_path / "film", 8, read_teeth(8, aside=range(7)))
+    unread = Teeth((*read_teeth(8, aside=range(7)).views[:6], *(
+        Dentition(f"{k:03d}", SIZE[::-1], UNREAD) for k in (6, 7)
+    )))  # fmt: skip
+    with pytest.raises(ReconstructionError, match=r"0 of 8 do .*jaw only; 2 were not read"):
+        auto(tmp_path / "unread", 8, unread)
     said = write(tmp_path / CORRECTIONS, "photographs: {p0.jpg: {use: true}}")
     auto(tmp_path / "b", 3, read, {CORRECTIONS: said})
     assert tried == [1]

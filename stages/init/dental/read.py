@@ -71,13 +71,16 @@ def refuse_mirrored(context: StageContext, views: Views, known: Container[str]) 
 
 
 def set_aside_reasons(teeth: Teeth, views: Views) -> str:
-    """Which photographs are set aside, and why; empty: none."""
+    """Which photographs are set aside, and why, and how many were not read; empty: none."""
     names = {view.name: photo_name(view) for view in views.views}
     reasons: dict[str, list[str]] = {}
     for dentition in teeth.views:
         if dentition.set_aside:
             reasons.setdefault(dentition.set_aside, []).append(names[dentition.name])
-    return "; ".join(f"{_some(those)}: {reason}" for reason, those in reasons.items())
+    said = [f"{_some(those)}: {reason}" for reason, those in reasons.items()]
+    if unread := sum(d.kind == UNREAD and not d.set_aside for d in teeth.views):
+        said.append(f"{unread} were not read: --set teeth.method=reader reads every one")
+    return "; ".join(said)
 
 
 def _some(names: Sequence[str]) -> str:
