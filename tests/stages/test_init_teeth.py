@@ -214,6 +214,11 @@ def test_why_photographs_are_set_aside_is_said_where_too_few_are_left(tmp_path, 
     few = ReconstructionError("Two are needed.")
     with pytest.raises(ReconstructionError, match=r"needed. p0.jpg, p2.jpg: it shows.*check.html"):
         run(tmp_path / "w", monkeypatch, few, read_teeth(aside=(0, 2)))
+    sides = ReconstructionError("One must be from the front.")
+    with pytest.raises(ReconstructionError, match=r"front. p1.jpg: it shows.*check.html"):
+        run(tmp_path / "f", monkeypatch, sides, read_teeth(aside=(1,)))
+    with pytest.raises(ReconstructionError, match=r"front\.$"):
+        run(tmp_path / "o", monkeypatch, sides, read_teeth(aside=(1,)), order="right,frontal,left")
 
 
 def test_a_photograph_said_to_be_mirrored_is_turned_over_with_its_teeth(tmp_path, monkeypatch):

@@ -35,6 +35,8 @@ Map = npt.NDArray[np.float32]
 #: and the next one has sat down after ten.
 _SITTING = 600.0
 _DAY = 86400.0
+#: Where fewer take part and there is no scene, it is said why others do not.
+_COMPLETE = 3
 
 
 def from_teeth(context: StageContext, views: Views) -> None:
@@ -47,7 +49,8 @@ def from_teeth(context: StageContext, views: Views) -> None:
     config: InitConfig = context.config
     read = teeth_to_place_by(context, views)
     given, views = views, turned_as_said(context, views)
-    dentitions = chosen_dentitions(read, views, ordered=config.dental.order is not None)
+    ordered = config.dental.order is not None
+    dentitions = chosen_dentitions(read, views, ordered)
     names = [photo_name(view) for view in views.views]
     try:
         teeth = reconstruct_teeth(
@@ -60,10 +63,11 @@ def from_teeth(context: StageContext, views: Views) -> None:
         kept = doubtful.artifacts.get("teeth")
         if isinstance(kept, TeethArtifact):
             doubtful.artifacts["teeth"] = updated(read, kept.views)
-        if len(read.chosen) < 2 and (aside := set_aside_reasons(read, views)):
+        aside = "" if ordered else set_aside_reasons(read, views)
+        if aside and len(read.chosen) < _COMPLETE:
             raise ReconstructionError(
                 f"{doubtful} {aside}. If one was set aside wrongly, say so in check.html.",
-                doubtful.pictures, {"teeth": read},
+                doubtful.pictures, {"teeth": read, **doubtful.artifacts},
             ) from doubtful  # fmt: skip
         raise
     for doubt in (
