@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.views import View, Views
+from pipeline.artifacts.views import View
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
@@ -105,11 +105,12 @@ def test_the_cameras_clock_speaks_for_one_mouth_or_against_it() -> None:
 def test_a_sitting_is_some_minutes_and_days_are_several(
     times: tuple[float | None, ...], said: bool | None
 ) -> None:
-    views = Views(
-        tuple(View(f"{k:03d}", np.zeros((4, 4, 3)), taken_after=t) for k, t in enumerate(times))
-    )
+    views = [
+        View(name, np.zeros((4, 4, 3)), source_name=f"{name}.jpg", taken_after=t)
+        for name, t in zip("abc", times, strict=True)
+    ]
     assert one_sitting(views) is said
-    warned = of_several_days(views, ["a.jpg", "b.jpg", "c.jpg"])
+    warned = of_several_days(views)
     assert len(warned) == (said is False)
     assert said is not False or "a.jpg was taken 12 days after c.jpg" in warned[0]
 

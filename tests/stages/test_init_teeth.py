@@ -274,13 +274,27 @@ def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypat
     assert millimetres("other", ramp[:, ::-1]) != pytest.approx(taken, rel=0.05)
 
 
+def test_photographs_that_take_no_part_do_not_speak_of_several_days():
+    times = (0.0, 30.0, 86400.0 * 12)
+    taken = zip(photographs().views, times, strict=True)
+    views = Views(tuple(replace(view, taken_after=after) for view, after in taken))
+    read = list(read_teeth().views)
+
+    def sitting(dentitions):
+        return place.arch_options(DentalConfig(), views, dentitions).one_sitting
+
+    assert (sitting(read), sitting([*read[:2], None])) == (False, True)
+
+
 def test_settings_reach_the_fit():
     views = photographs()
-    options = place.arch_options(DentalConfig(order="right, frontal,left", min_margin=21), views)
+    dentitions = list(read_teeth().views)
+    config = DentalConfig(order="right, frontal,left", min_margin=21)
+    options = place.arch_options(config, views, dentitions)
     assert options.order == ("right", "frontal", "left")
     assert options.min_margin == 21
     with pytest.raises(RequestError, match="names 2 photographs"):
-        place.arch_options(DentalConfig(order="right,left"), views)
+        place.arch_options(DentalConfig(order="right,left"), views, dentitions)
     assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2
 
 

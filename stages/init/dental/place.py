@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
     try:
         teeth = reconstruct_teeth(
             list(views.views), names, dentitions, with_focals(views.views, config.focal),
-            arch_options(config.dental, views), surface_options(config.dental),
+            arch_options(config.dental, views, dentitions), surface_options(config.dental),
             accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
             progress=context.progress,
         )  # fmt: skip
@@ -73,7 +73,8 @@ def from_teeth(context: StageContext, views: Views) -> None:
     for doubt in (
         *teeth.fit.doubts, *only_two(names, teeth), *in_another_light(names, teeth),
         *turned_back(names, teeth), *misnamed(names, teeth),
-        *numbered_otherwise(teeth, config.dental.min_margin), *of_several_days(views, names),
+        *numbered_otherwise(teeth, config.dental.min_margin),
+        *of_several_days(taking_part(views, dentitions)),
     ):  # fmt: skip
         context.warn(doubt)
     numbered = replace(
@@ -92,6 +93,11 @@ def chosen_dentitions(read: TeethArtifact, views: Views, ordered: bool) -> list[
     kept = [d for d in read.views if d.set_aside != LEFT_OUT] if ordered else read.chosen
     chosen = {dentition.name: dentition for dentition in kept}
     return [chosen.get(view.name) for view in views.views]
+
+
+def taking_part(views: Views, dentitions: Sequence[Dentition | None]) -> list[View]:
+    """The views whose crowns are used."""
+    return [view for view, seen in zip(views.views, dentitions, strict=True) if seen is not None]
 
 
 def updated(read: TeethArtifact, numbered: Iterable[Dentition]) -> TeethArtifact:
@@ -150,29 +156,29 @@ def numbered_otherwise(teeth: Reconstruction, min_margin: float) -> list[str]:
     ]
 
 
-def one_sitting(views: Views) -> bool | None:
-    """Were all photographs taken within minutes, or on several days, by the camera's clock?
+def one_sitting(views: Sequence[View]) -> bool | None:
+    """Were some photographs taken within minutes, or on several days, by the camera's clock?
 
     None where it says neither: photographs lose their times when they are sent or edited.
     """
-    times = [view.taken_after for view in views.views if view.taken_after is not None]
+    times = [view.taken_after for view in views if view.taken_after is not None]
     if len(times) < max(2, len(views)):
         return None
     between = max(times) - min(times)
     return True if between <= _SITTING else False if between >= _DAY else None
 
 
-def of_several_days(views: Views, names: list[str]) -> list[str]:
+def of_several_days(views: Sequence[View]) -> list[str]:
     """What to say of photographs that were taken on several days."""
     if one_sitting(views) is not False:
         return []
-    times = [view.taken_after or 0.0 for view in views.views]
-    first, last = int(np.argmin(times)), int(np.argmax(times))
-    days = round((times[last] - times[first]) / _DAY)
+    times = [view.taken_after or 0.0 for view in views]
+    days = round((max(times) - min(times)) / _DAY)
+    first, last = (photo_name(views[times.index(pick(times))]) for pick in (min, max))
     return [
-        f"{names[last]} was taken {days} day{'s' if days > 1 else ''} after {names[first]}, by the "
-        "camera's clock: are they of one patient and one visit? Teeth that have moved between "
-        "would be seen in two places."
+        f"{last} was taken {days} day{'s' if days > 1 else ''} after {first}, by the camera's "
+        "clock: are they of one patient and one visit? Teeth that have moved between would be seen "
+        "in two places."
     ]
 
 
@@ -291,8 +297,13 @@ def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
     }
 
 
-def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
+def arch_options(
+    config: DentalConfig, views: Views, dentitions: Sequence[Dentition | None]
+) -> ArchOptions:
     """The settings of the arch fit.
+
+    Args:
+        dentitions: of each view, None: it takes no part.
 
     Raises:
         RequestError: an order that doesn't fit the photographs.
@@ -304,7 +315,7 @@ def arch_options(config: DentalConfig, views: Views) -> ArchOptions:
         )
     shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
     settings = {name: getattr(config, name) for name in sorted(shared)}
-    return ArchOptions(**settings, one_sitting=one_sitting(views))
+    return ArchOptions(**settings, one_sitting=one_sitting(taking_part(views, dentitions)))
 
 
 def surface_options(config: DentalConfig) -> SurfaceOptions:
