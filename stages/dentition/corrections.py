@@ -43,7 +43,8 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
     """The teeth with what a person said put in place.
 
     A number that a person gave has doubt 0. The two parts of a crown that was split have none until
-    they are given one. Landmarks are computed again where crowns went, came or changed jaw.
+    they are given one. Landmarks are computed again where crowns went, came or changed jaw. What
+    was set aside because a photograph shows the same that is now left out by hand takes its place.
 
     Args:
         teeth: as read from the photographs.
@@ -69,7 +70,18 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
             where = f"{corrections.file}, photograph '{label}'"
             dentition = _corrected(dentition, by_name[dentition.name], photo, where)
         corrected.append(dentition)
+    names = {view.name: view.source_name or view.name for view in views.views}
+    for out in [seen for seen in corrected if seen.set_aside == LEFT_OUT]:
+        reason = shows_less(names[out.name])
+        second = next((k for k, seen in enumerate(corrected) if seen.set_aside == reason), None)
+        if second is not None:
+            corrected[second] = replace(corrected[second], set_aside="")
     return Teeth(tuple(corrected))
+
+
+def shows_less(name: str) -> str:
+    """Why a photograph is set aside beside another one, which the user knows by this name."""
+    return f"it shows the same as {name}, which is clearer"
 
 
 def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, PhotoCorrection]]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
-from stages.dentition.corrections import SIDES, area, says_side
+from stages.dentition.corrections import SIDES, area, says_side, shows_less
 from stages.teeth.config import TeethConfig
 from stages.teeth.read import Reading, row_extent
 
@@ -125,7 +125,7 @@ def _repeated(
                 continue  # one is a mirror image, and of another side
             off = layout_distance(readings[k].dentition, readings[other].dentition)
             if off is not None and off < config.same_view:
-                result[k] = f"it shows the same as {names[other]}, which is clearer"
+                result[k] = shows_less(names[other])
                 break
     return result
 

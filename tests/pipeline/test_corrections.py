@@ -24,7 +24,13 @@ from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.store import Store
-from stages.dentition.corrections import LEFT_OUT, apply_corrections, area, split_polygon
+from stages.dentition.corrections import (
+    LEFT_OUT,
+    apply_corrections,
+    area,
+    shows_less,
+    split_polygon,
+)
 from stages.dentition.crowns import dentition_of, outline_of
 from stages.dentition.parts import perhaps_one
 from tests import teeth_case as case
@@ -286,6 +292,25 @@ def test_photographs_are_left_out_used_and_called_otherwise() -> None:
     empty = Teeth((Dentition("000", (300, 200), "none"), *teeth.views[1:]))
     with pytest.raises(RequestError, match="no tooth was found in this photograph"):
         applied(empty, v000=PhotoCorrection(use=True))
+
+
+def test_the_next_best_takes_the_place_of_a_photograph_that_is_left_out() -> None:
+    first, *others = case.teeth().views
+    name = case.views().views[0].source_name
+    aside = [replace(view, set_aside=shows_less(name)) for view in others]
+    teeth = Teeth((first, *aside))
+    assert [view.set_aside for view in applied(teeth, v000=PhotoCorrection(use=True))[1:]] == [
+        shows_less(name)
+    ] * len(aside)
+    out = PhotoCorrection(use=False)
+    after = applied(teeth, v000=out)
+    assert [view.set_aside for view in after] == [
+        LEFT_OUT,
+        "",
+        *[shows_less(name)] * len(aside[1:]),
+    ]
+    both = applied(teeth, v000=out, v001=out)
+    assert [view.set_aside for view in both][:3] == [LEFT_OUT, LEFT_OUT, ""]
 
 
 #: From left to right in a photograph of the patient's right side as it was taken.
