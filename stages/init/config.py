@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from pipeline.artifacts.dental.fdi import ALL_TEETH, THE_NUMBERS
@@ -180,21 +180,23 @@ class PointmapConfig(StageConfig):
         }
 
 
+def _is_tooth(number: int) -> int:
+    if number not in ALL_TEETH:
+        why = f"it is no tooth's number; {THE_NUMBERS}"
+        raise PydanticCustomError("tooth", "{why}", {"why": why})
+    return number
+
+
+ToothNumber = Annotated[int, AfterValidator(_is_tooth)]
+
+
 class ToothConfig(StageConfig):
     """The number of one tooth, as a person knows it."""
 
     photo: str = Field(description="file name of the photograph")
     x: float = Field(description="a point on the crown, pixels of that photograph (upright)")
     y: float = Field(description="a point on the crown, pixels of that photograph (upright)")
-    tooth: int = Field(ge=11, le=85, description="its FDI number")
-
-    @field_validator("tooth")
-    @classmethod
-    def _known(cls, value: int) -> int:
-        if value not in ALL_TEETH:
-            why = f"it is no tooth's number; {THE_NUMBERS}"
-            raise PydanticCustomError("tooth", "{why}", {"why": why})
-        return value
+    tooth: ToothNumber = Field(description="its FDI number")
 
 
 class DentalConfig(StageConfig):
@@ -210,7 +212,7 @@ class DentalConfig(StageConfig):
         description="what a person says of the teeth: a file as the page check.html saves it, or "
         "a list of teeth whose number is known; teeth.yaml in the workspace is used by itself",
     )
-    tooth_widths: dict[int, Annotated[float, Field(gt=2, lt=20)]] = Field(
+    tooth_widths: dict[ToothNumber, Annotated[float, Field(gt=2, lt=20)]] = Field(
         {}, description="known mesiodistal widths in mm by FDI number, for the scale"
     )
     focal_per_side: float = Field(

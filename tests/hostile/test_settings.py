@@ -177,6 +177,8 @@ def test_numbers_that_no_tooth_has_are_refused(tooth: int) -> None:
     assert said.startswith(f"init.dental.labels.0.tooth={tooth} is not allowed: it is no tooth's")
     assert "FDI numbers are 11-18, " in said and "string" not in said
     load_config(None, [given.replace(f"tooth: {tooth}", "tooth: 55")])
+    widths = refused(lambda: load_config(None, [f"init.dental.tooth_widths={{11: 8, {tooth}: 8}}"]))
+    assert "tooth_widths" in widths and "it is no tooth's number; FDI numbers are" in widths
 
 
 def test_names_may_be_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
