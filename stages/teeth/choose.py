@@ -64,8 +64,9 @@ def _unusable(reading: Reading, image: Array32, config: TeethConfig) -> str:
     dentition = reading.dentition
     if chroma(image) < config.least_colour:
         return "it has no colour: an X-ray, or not a photograph"
-    if len(dentition.all_crowns) < config.least_crowns:
-        return f"no row of teeth was found in it ({len(dentition.all_crowns)} crowns)"
+    count = len(dentition.all_crowns)
+    if count < config.least_crowns:
+        return f"no row of teeth was found in it ({count} crown{'s' * (count != 1)})"
     if usual_score(dentition) < config.least_score:
         return "what was found in it hardly looks like teeth"
     if row_extent(dentition) < config.least_extent:

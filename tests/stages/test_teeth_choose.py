@@ -93,6 +93,8 @@ def test_pictures_without_colour_teeth_or_size_are_set_aside() -> None:
     assert "colour" in reasons(good, images=[picture(colour=0.0)])[0]
     few = replace(good.dentition, upper=good.dentition.upper[:2], lower=good.dentition.lower[:2])
     assert "(4 crowns)" in reasons(reading(few))[0]
+    one = replace(good.dentition, upper=good.dentition.upper[:1], lower=())
+    assert "(1 crown)" in reasons(reading(one))[0]
     none = reading(Dentition("000", SIZE, "none"), "other")
     assert "(0 crowns)" in reasons(none)[0]
     windows = tuple(replace(crown, score=0.7) for crown in good.dentition.upper)
