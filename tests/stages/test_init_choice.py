@@ -14,6 +14,7 @@ from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import LocalContext
+from stages.dentition.corrections import LEFT_OUT
 from stages.init.config import InitConfig
 from stages.init.dental.choice import ByTeeth
 from stages.init.dental.place import only_two
@@ -293,3 +294,17 @@ def test_corrections_are_places_of_the_photograph_as_it_was_taken(tmp_path):
         for views in (given, turned)
     ]
     assert sum(said[0]) == 1 and said[0] == said[1]
+
+
+def test_corrections_hold_where_the_photograph_that_they_name_is_not_placed(tmp_path):
+    text = "photographs: {p0.jpg: {crowns: [{at: [35, 30], tooth: 22}]}, p2.jpg: {use: false}}"
+    sources = {CORRECTIONS: write(tmp_path / "teeth.yaml", text)}
+    given = photographs(3)
+    inputs = {"views": given, "teeth": read_teeth()}
+    context = LocalContext(InitConfig(), tmp_path / "w", inputs, sources, threads=1)
+    placed = labelled_teeth(context, replace(given, views=given.views[:2]))
+    whole = labelled_teeth(context, given)
+    assert [view.set_aside for view in placed.views] == ["", "", LEFT_OUT]
+    assert [[crown.number for crown in view.all_crowns] for view in placed.views] == [
+        [crown.number for crown in view.all_crowns] for view in whole.views
+    ]

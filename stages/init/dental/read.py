@@ -107,6 +107,9 @@ def teeth_to_place_by(context: StageContext, views: Views) -> Teeth:
 def labelled_teeth(context: StageContext, views: Views) -> Teeth:
     """The teeth that were read from the photographs, with what a person has said of them.
 
+    Args:
+        views: the photographs, or some of them.
+
     Raises:
         RequestError: the stage `teeth` has not run, or what was said fits no crown.
     """
@@ -116,8 +119,9 @@ def labelled_teeth(context: StageContext, views: Views) -> Teeth:
             "`init`, as in --stages teeth,init."
         )
     read: Teeth = context.load("teeth")
+    corrections = []
     if CORRECTIONS in context.sources:
-        read = apply_corrections(read, views, read_corrections(context.sources[CORRECTIONS]))
+        corrections.append(read_corrections(context.sources[CORRECTIONS]))
     said = context.config.dental.labels
     if not isinstance(said, str) and said:
         photographs: dict[str, PhotoCorrection] = {}
@@ -125,5 +129,9 @@ def labelled_teeth(context: StageContext, views: Views) -> Teeth:
             before = photographs.get(hint.photo, PhotoCorrection())
             crown = CrownCorrection((hint.x, hint.y), hint.tooth)
             photographs[hint.photo] = replace(before, crowns=(*before.crowns, crown))
-        read = apply_corrections(read, views, Corrections(photographs, "init.dental.labels"))
+        corrections.append(Corrections(photographs, "init.dental.labels"))
+    if corrections and len(views) < len(read.views):  # what is said may be of the others
+        views = context.load("views")
+    for each in corrections:
+        read = apply_corrections(read, views, each)
     return read
