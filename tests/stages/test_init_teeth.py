@@ -1,6 +1,7 @@
 """From the dental path's result to the stage's outputs."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -274,6 +275,12 @@ def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypat
     assert millimetres("other", ramp[:, ::-1]) != pytest.approx(taken, rel=0.05)
 
 
+def options_of(views, dentitions, part=None, **dental):
+    config = InitConfig(method="dental", dental=dental)
+    context = LocalContext(config, Path(), inputs={"views": views}, threads=1)
+    return place.arch_options(context, part or views, dentitions)
+
+
 def test_photographs_that_take_no_part_do_not_speak_of_several_days():
     times = (0.0, 30.0, 86400.0 * 12)
     taken = zip(photographs().views, times, strict=True)
@@ -281,7 +288,7 @@ def test_photographs_that_take_no_part_do_not_speak_of_several_days():
     read = list(read_teeth().views)
 
     def sitting(dentitions):
-        return place.arch_options(DentalConfig(), views, dentitions).one_sitting
+        return options_of(views, dentitions).one_sitting
 
     assert (sitting(read), sitting([*read[:2], None])) == (False, True)
 
@@ -289,12 +296,14 @@ def test_photographs_that_take_no_part_do_not_speak_of_several_days():
 def test_settings_reach_the_fit():
     views = photographs()
     dentitions = list(read_teeth().views)
-    config = DentalConfig(order="right, frontal,left", min_margin=21)
-    options = place.arch_options(config, views, dentitions)
+    options = options_of(views, dentitions, order="right, frontal,left", min_margin=21)
     assert options.order == ("right", "frontal", "left")
+    placed = Views((views.views[0], views.views[2]))
+    some = options_of(views, dentitions[:2], placed, order="right,frontal,left")
+    assert some.order == ("right", "left")
     assert options.min_margin == 21
     with pytest.raises(RequestError, match="names 2 photographs"):
-        place.arch_options(DentalConfig(order="right,left"), views, dentitions)
+        options_of(views, dentitions, order="right,left")
     assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2
 
 

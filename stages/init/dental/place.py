@@ -55,7 +55,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
     try:
         teeth = reconstruct_teeth(
             list(views.views), names, dentitions, with_focals(views.views, config.focal),
-            arch_options(config.dental, views, dentitions), surface_options(config.dental),
+            arch_options(context, views, dentitions), surface_options(config.dental),
             accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
             progress=context.progress,
         )  # fmt: skip
@@ -298,23 +298,29 @@ def tooth_counts(teeth: Reconstruction) -> dict[str, float]:
 
 
 def arch_options(
-    config: DentalConfig, views: Views, dentitions: Sequence[Dentition | None]
+    context: StageContext, views: Views, dentitions: Sequence[Dentition | None]
 ) -> ArchOptions:
     """The settings of the arch fit.
 
     Args:
-        dentitions: of each view, None: it takes no part.
+        views: the photographs, or some of them.
+        dentitions: of each, None: it takes no part.
 
     Raises:
         RequestError: an order that doesn't fit the photographs.
     """
-    if config.order is not None and len(config.order) != len(views):
-        raise RequestError(
-            f"init.dental.order names {len(config.order)} photographs "
-            f"({','.join(config.order)}), but there are {len(views)}."
-        )
+    config: DentalConfig = context.config.dental
     shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
     settings = {name: getattr(config, name) for name in sorted(shared)}
+    if config.order is not None:
+        every = context.load("views").views
+        if len(config.order) != len(every):
+            raise RequestError(
+                f"init.dental.order names {len(config.order)} photographs "
+                f"({','.join(config.order)}), but there are {len(every)}."
+            )
+        said = {view.name: role for view, role in zip(every, config.order, strict=True)}
+        settings["order"] = tuple(said[view.name] for view in views.views)
     return ArchOptions(**settings, one_sitting=one_sitting(taking_part(views, dentitions)))
 
 

@@ -137,7 +137,7 @@ class HeldTeeth:
         Raises:
             ReconstructionError: no teeth, or they are doubtful, or don't fit the cameras.
         """
-        options = arch_options(context.config.dental, views, self.dentitions)
+        options = arch_options(context, views, self.dentitions)
         progress: Progress = context.progress
         if quickly:
             options, progress = replace(options, dense_rounds=0), lambda *_: None
