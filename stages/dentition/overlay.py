@@ -106,7 +106,9 @@ def _number(picture: Picture, crown: Crown, scale: float) -> None:
 
 
 def _box(picture: Picture, text: str, place: Point, colour: Colour, size: float) -> None:
-    """White text on a coloured box around a place, kept inside the picture."""
+    """White text on a coloured box around a place, kept inside the picture; small if it is long."""
+    room = picture.shape[1] - 9
+    size *= min(1.0, room / cv2.getTextSize(text, FONT, size, 2)[0][0])
     (width, height), base = cv2.getTextSize(text, FONT, size, 2)
     x = int(np.clip(place[0] - width / 2, 4, picture.shape[1] - width - 5))
     y = int(np.clip(place[1] + height / 2, height + 4, picture.shape[0] - base - 4))
