@@ -154,7 +154,7 @@ def test_photographs_set_aside_take_no_part_unless_their_order_is_given(tmp_path
     assert [d and d.name for d in asked] == ["000", None, "002"]
     asked.clear()
     run(tmp_path / "b", monkeypatch, found_teeth(), read, asked, order="right,frontal,left")
-    assert [d.name for d in asked] == ["000", "001", "002"]
+    assert [(d.name, d.set_aside) for d in asked] == [("000", ""), ("001", ""), ("002", "")]
     asked.clear()
     left_out = "photographs: {p2.jpg: {use: false}}"
     run(

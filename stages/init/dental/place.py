@@ -90,7 +90,9 @@ def chosen_dentitions(read: TeethArtifact, views: Views, ordered: bool) -> list[
         ordered: a person has said what each photograph shows: only what a person leaves out is set
             aside.
     """
-    kept = [d for d in read.views if d.set_aside != LEFT_OUT] if ordered else read.chosen
+    kept = read.chosen
+    if ordered:
+        kept = tuple(replace(d, set_aside="") for d in read.views if d.set_aside != LEFT_OUT)
     chosen = {dentition.name: dentition for dentition in kept}
     return [chosen.get(view.name) for view in views.views]
 
