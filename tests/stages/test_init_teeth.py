@@ -16,7 +16,7 @@ from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
 from stages.init.dental.read import labelled_teeth
 from stages.init.dental.reconstruct import as_sentence, with_numbers
-from stages.init.dental.scale import crown_width, scale_from_widths
+from stages.init.dental.scale import crown_width, scale_from_widths, width_doubts
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import (
     LOWER,
@@ -97,9 +97,17 @@ def test_known_tooth_width_gives_the_scale(tmp_path, monkeypatch):
     assert scale_from_widths(found.fit, {})[0] == 1
     with pytest.raises(RequestError, match="none was seen with both its neighbours"):
         scale_from_widths(found.fit, {16: 10.0})
+    # primary and permanent at once: as many widths, one far off
+    assert scale_from_widths(found.fit, {11: 8.5, 51: 8.5}) == pytest.approx((1, 0.06 / 2**0.5))
+    factor, deviation = scale_from_widths(found.fit, {11: 8.5, 51: 6.8})
+    assert factor == pytest.approx(0.9) and deviation == pytest.approx(np.log(1.25) / 2)
+    assert width_doubts(found.fit, {11: 8.5}) == width_doubts(found.fit, {11: 8.5, 51: 8.0}) == []
+    (said,) = width_doubts(found.fit, {11: 8.5, 51: 6.0})
+    assert "by 11 the mouth is 42% larger than by 51" in said
+    assert "16 tells nothing of the scale" in width_doubts(found.fit, {11: 8.5, 16: 10.0})[0]
     context = run(tmp_path, monkeypatch, found, tooth_widths={11: 10.2})
     cameras = context.result("cameras")
-    assert cameras.scale == Scale("mm", "tooth_widths", 4.0)
+    assert cameras.scale == Scale("mm", "tooth_widths", 6.0)
     scale = np.cbrt(np.linalg.det(cameras.input_from_world[:3, :3]))
     distance = scale * np.linalg.norm(cameras.cameras[0].centre - cameras.cameras[2].centre)
     truth = np.linalg.norm(

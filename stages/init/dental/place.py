@@ -22,7 +22,7 @@ from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.read import set_aside_reasons, teeth_to_place_by, turned_as_said
 from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
-from stages.init.dental.scale import scale_from_widths
+from stages.init.dental.scale import scale_from_widths, width_doubts
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.mouth import mouth_frame
 from stages.init.place import photo_name, with_focals
@@ -256,7 +256,10 @@ def _write(
         method="dental", **tooth_counts(teeth),
         scale_uncertainty_percent=round(100 * uncertainty, 1),
     )  # fmt: skip
-    if config.length.mm is None and not config.dental.tooth_widths:
+    if config.dental.tooth_widths:
+        for doubt in width_doubts(teeth.fit, config.dental.tooth_widths):
+            context.warn(doubt)
+    elif config.length.mm is None:
         context.warn(
             f"{placement.scale.text} Pass a known width for a true scale, as in --set "
             "'init.dental.tooth_widths={11: 8.6}'."

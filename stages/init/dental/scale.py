@@ -12,8 +12,11 @@ from pipeline.errors import RequestError
 from stages.init.dental.landmarks import Landmark
 from stages.init.dental.solution import ArchFit
 
-#: Relative standard deviation of a crown's width as it comes out between its landmarks.
-WIDTH_DEVIATION = 0.04
+#: Relative standard deviation of a crown's width as it comes out between its landmarks: .059 of 213
+#: crowns of eleven generated mouths, .07 of incisors and .05 of the others.
+WIDTH_DEVIATION = 0.06
+#: Scales by two crowns that are further apart than this contradict each other: three deviations.
+DISAGREEING = 3 * 2**0.5 * WIDTH_DEVIATION
 
 
 def crown_width(fit: ArchFit, tooth: int) -> float | None:
@@ -46,12 +49,7 @@ def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float,
     """
     if not widths:
         return 1.0, TEXTBOOK_DEVIATION
-    ratios = {
-        tooth: known / measured
-        for tooth, known in sorted(widths.items())
-        if (place := permanent_of(tooth)) in (*teeth_of("upper"), *teeth_of("lower"))
-        and (measured := crown_width(fit, place)) is not None
-    }
+    ratios = _ratios(fit, widths)
     if not ratios:
         raise RequestError(
             f"init.dental.tooth_widths: of the teeth named ({', '.join(map(str, sorted(widths)))}) "
@@ -59,4 +57,34 @@ def scale_from_widths(fit: ArchFit, widths: Mapping[int, float]) -> tuple[float,
             "teeth, such as 11 or 21."
         )
     found = np.array(list(ratios.values()))
-    return float(np.median(found)), float(WIDTH_DEVIATION / np.sqrt(len(found)))
+    spread = float(np.log(found).std(ddof=1)) if len(found) > 1 else 0.0
+    return float(np.median(found)), max(WIDTH_DEVIATION, spread) / float(np.sqrt(len(found)))
+
+
+def width_doubts(fit: ArchFit, widths: Mapping[int, float]) -> list[str]:
+    """What to say of widths that do not count, and of such as contradict each other."""
+    ratios = _ratios(fit, widths)
+    doubts = []
+    if unseen := [str(tooth) for tooth in sorted(widths) if tooth not in ratios]:
+        doubts.append(
+            f"init.dental.tooth_widths: {', '.join(unseen)} tells nothing of the scale, for not "
+            "both neighbours were seen."
+        )
+    least, most = (pick(ratios, key=lambda tooth: ratios[tooth]) for pick in (min, max))
+    more = ratios[most] / ratios[least] - 1
+    if more > DISAGREEING:
+        doubts.append(
+            f"init.dental.tooth_widths contradict each other: by {most} the mouth is {more:.0%} "
+            f"larger than by {least}. Is one of them mistyped, or of another tooth?"
+        )
+    return doubts
+
+
+def _ratios(fit: ArchFit, widths: Mapping[int, float]) -> dict[int, float]:
+    """FDI number -> its width over that in the arch frame, of those seen with both neighbours."""
+    return {
+        tooth: known / measured
+        for tooth, known in sorted(widths.items())
+        if (place := permanent_of(tooth)) in (*teeth_of("upper"), *teeth_of("lower"))
+        and (measured := crown_width(fit, place)) is not None
+    }
