@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -77,8 +78,8 @@ def photograph(
     patient: int, noise: int, smooth: bool = False,
 ) -> Look:  # fmt: skip
     """Render balls with what each did since the first visit ([4, 4]); see `texture`, `shaded`."""
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(u - camera.cx) / FOCAL, (v - camera.cy) / FOCAL, np.ones_like(u)], -1)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
     rays = rays.reshape(-1, 3) @ camera.rotation  # in the world, 1 long along the axis
     depth = np.full(len(rays), np.inf)
     image = np.full(len(rays), 0.25)
@@ -100,7 +101,7 @@ def photograph(
         else:
             image[nearer] = texture(own, seed)
     grain = np.random.default_rng(noise).normal(0, 0.004, len(image))
-    shape = HEIGHT, WIDTH
+    shape = camera.height, camera.width
     return Look(
         camera, (image + grain).reshape(shape).astype(np.float32), labels.reshape(shape),
         np.where(np.isfinite(depth), depth, 0).reshape(shape).astype(np.float32),
@@ -110,7 +111,7 @@ def photograph(
 
 def toy_visit(
     name: str, motions: Mapping[int, np.ndarray] | None = None, patient: int = 1,
-    turn: float = 0.0, smooth: bool = False,
+    turn: float = 0.0, smooth: bool = False, larger: int = 1,
 ) -> Visit:  # fmt: skip
     """A visit of four photographs.
 
@@ -120,23 +121,23 @@ def toy_visit(
         patient: another one has other surfaces, and teeth a little elsewhere.
         turn: degrees that the photographs are taken from further left.
         smooth: whether crowns have faint marks under light that goes with the camera.
+        larger: so many times as wide the photographs are as the visit has them.
     """
     centres = toy_centres()
     if patient != 1:
         rng = np.random.default_rng(patient)
         centres = {n: c + rng.normal(0, 0.5, 3) for n, c in centres.items()}
-    looks = tuple(
-        photograph(
-            toy_camera(yaw + turn, f"{k:03d}", 2.0),
-            centres,
-            motions or {},
-            patient,
-            97 * len(name) + k,
-            smooth,
-        )
-        for k, yaw in enumerate((-42.0, -14.0, 14.0, 42.0))
-    )
-    return Visit(name, looks, teeth_points(looks))
+    looks = []
+    for k, yaw in enumerate((-42.0, -14.0, 14.0, 42.0)):
+        camera = toy_camera(yaw + turn, f"{k:03d}", 2.0)
+        noise = 97 * len(name) + k
+        look = photograph(camera, centres, motions or {}, patient, noise, smooth)
+        if larger > 1:
+            big = camera.resized(larger * WIDTH, larger * HEIGHT)
+            image = photograph(big, centres, motions or {}, patient, noise, smooth).image
+            look = replace(look, larger=image)
+        looks.append(look)
+    return Visit(name, tuple(looks), teeth_points(looks))
 
 
 def motion(centre: np.ndarray, shift: tuple[float, ...], turn: tuple[float, ...]) -> np.ndarray:

@@ -22,7 +22,7 @@ from pipeline.studies.register.estimate import (
     started,
 )
 from pipeline.studies.register.geometry import first_frame
-from pipeline.studies.register.photometric import judged
+from pipeline.studies.register.pictures.photometric import judged
 from pipeline.studies.register.uncertainty import USUAL, misfit
 from pipeline.studies.register.visit import Visit, scale_of, teeth_points, textbook_scale
 from pipeline.studies.register.writing import described
@@ -176,14 +176,15 @@ def test_contrast_itself_improves_what_few_photographs_show(
 def test_marks_tell_turns_where_shading_stays_with_the_light(motions: dict) -> None:
     """Flow takes shading along; where there are no marks what it says is kept."""
     first, second = (
-        toy_visit("first", smooth=True),
-        toy_visit("second", motions, turn=3.0, smooth=True),
+        toy_visit("first", smooth=True, larger=2),
+        toy_visit("second", motions, turn=3.0, smooth=True, larger=2),
     )
     still = sorted(set(first.teeth) - set(motions))
     begun = started(first, second, np.eye(4), still)
     rng = np.random.default_rng(3)
     blank = tuple(
-        replace(p, marks=rng.integers(88, 168, p.marks.shape, np.uint8)) for p in begun.first
+        replace(p, look=replace(p.look, larger=rng.random(p.look.image.shape, np.float32)))
+        for p in begun.first
     )
     off = {
         name: np.array([turned_off(found, motions, n) for n in motions])
@@ -193,6 +194,25 @@ def test_marks_tell_turns_where_shading_stays_with_the_light(motions: dict) -> N
     }  # fmt: skip
     assert (off["no marks"] > 1.0).all()
     assert (off["marks"] < 0.75 * off["no marks"]).all()
+
+
+def test_larger_photographs_tell_turns_better(motions: dict) -> None:
+    first, second = (
+        toy_visit("first", smooth=True, larger=3),
+        toy_visit("second", motions, turn=3.0, smooth=True, larger=3),
+    )
+    begun = started(first, second, np.eye(4), sorted(set(first.teeth) - set(motions)))
+    small = replace(
+        begun,
+        first=tuple(replace(p, look=replace(p.look, larger=None)) for p in begun.first),
+        second=tuple(replace(p, look=replace(p.look, larger=None)) for p in begun.second),
+    )
+    off, off_small = (
+        np.array([turned_off(finished(found), motions, n) for n in motions])
+        for found in (begun, small)
+    )
+    assert (off < off_small).all()
+    assert off.sum() < 0.6 * off_small.sum()
 
 
 def turned_off(found: Estimate, motions: dict, tooth: int) -> float:

@@ -24,13 +24,13 @@ from pipeline.studies.register.estimate import (
     started,
 )
 from pipeline.studies.register.geometry import inverted
-from pipeline.studies.register.photometric import (
+from pipeline.studies.register.pictures.photometric import (
     CLEARLY,
     FINE,
     LEAST_PHOTOGRAPHS,
-    Pictures,
     facings,
     photographs,
+    pictures_of,
     score,
 )
 from pipeline.studies.register.visit import Visit
@@ -114,7 +114,7 @@ class _Way:
 
     def __init__(self, found: Started) -> None:
         self.state = found.state
-        self.pictures = Pictures(found.first), Pictures(found.second)
+        self.pictures = pictures_of(found.first), pictures_of(found.second)
         self.pairs = compared_pairs(found.first, found.state)
 
     def fit(self, tooth: int, motion: Array) -> _Fit:

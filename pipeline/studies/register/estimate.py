@@ -13,7 +13,9 @@ from pipeline.kernels.threads import in_threads
 from pipeline.measure import usable_cores
 from pipeline.studies.register import solving
 from pipeline.studies.register.geometry import Laid, laid_crowns
-from pipeline.studies.register.matching import (
+from pipeline.studies.register.movement import tooth_axes
+from pipeline.studies.register.pictures.marks import mark_spots, marks_of
+from pipeline.studies.register.pictures.matching import (
     Prepared,
     Spots,
     outlines_between,
@@ -21,14 +23,11 @@ from pipeline.studies.register.matching import (
     prepare,
     spots_between,
 )
-from pipeline.studies.register.movement import tooth_axes
-from pipeline.studies.register.photometric import (
+from pipeline.studies.register.pictures.photometric import (
     FITS,
     PRIOR,
-    Marks,
     facings,
     judged,
-    mark_spots,
     searched,
 )
 from pipeline.studies.register.solving import Block, Pull, State
@@ -52,7 +51,7 @@ FIRM = 0.01
 EXPECTED, CLEAR = 0.5, 0.3
 #: A tooth is measured if it has so many spots in all.
 LEAST_SPOTS = 120
-#: Rounds of laying marks onto each other, by their blur (see `photometric.MARK_BLURS`), steps of
+#: Rounds of laying marks onto each other, by their blur (see `marks.BLURS`), steps of
 #: each, and points of a crown in a pair of photographs and pairs at most.
 MARK_ROUNDS, MARK_STEPS, MARK_POINTS, MARK_PAIRS = (0, 1, 1, 1), 3, 1000, 24
 #: Marks tell what a tooth did if they correlate by this at the end. Of a generated mouth they do by
@@ -188,7 +187,7 @@ def by_marks(
         The state by the marks; the spots that it rests on, those of flow where marks do not tell;
         the numbers of the teeth of which they do.
     """
-    a, b = Marks(found.first), Marks(found.second)
+    a, b = (marks_of([p.look for p in visit]) for visit in (found.first, found.second))
     pairs = compared_pairs(found.first, state)
     teeth = sorted({s.tooth for s in spots if len(s.points)})
     views = [v for n in teeth for v in facings(n, a, b, state, pairs, MARK_POINTS, MARK_PAIRS)]

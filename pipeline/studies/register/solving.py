@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.rigid import exponential, moved_by, nearest_rotation
-from pipeline.studies.register.matching import Spots
+from pipeline.studies.register.pictures.matching import Spots
 
 Array = npt.NDArray[np.float64]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,8 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
 from pipeline.geometry.world import move_camera
-from pipeline.studies.register.hardware import braces_in, painted_over
+from pipeline.studies.register.pictures.hardware import braces_in, painted_over
+from pipeline.studies.register.pictures.originals import larger_photographs
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -43,6 +45,8 @@ class Look:
         depth: [H, W] float32 z of the scene, mm; 0 where it is not known.
         valid: [H, W] bool, where the photograph may be used.
         hardware: [H, W] bool, brackets and wires; None: there are no braces.
+        larger: [H', W'] float32 `image` with more pixels, where the photograph has them and is at
+            hand; None: it does not.
     """
 
     camera: Camera
@@ -51,6 +55,7 @@ class Look:
     depth: Floats
     valid: npt.NDArray[np.bool_]
     hardware: npt.NDArray[np.bool_] | None = None
+    larger: Floats | None = None
 
     @property
     def enamel(self) -> Labels:
@@ -76,6 +81,25 @@ class Look:
     def points(self) -> Array:
         """[H, W, 3] what each pixel sees, mm; meaningless where depth is 0."""
         return self.camera.unproject(self.depth)
+
+    @property
+    def enlarged(self) -> Look:
+        """The photograph with all the pixels that are at hand."""
+        if self.larger is None:
+            return self
+        size = self.larger.shape[1], self.larger.shape[0]
+
+        def nearest(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            kept = cv2.resize(pixels.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+            return np.asarray(kept).astype(pixels.dtype)
+
+        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_LINEAR)
+        return replace(
+            self, camera=self.camera.resized(*size), image=self.larger, larger=None,
+            labels=nearest(self.labels), valid=nearest(self.valid),
+            depth=np.where(nearest(self.depth > 0), depth, 0).astype(np.float32),
+            hardware=None if self.hardware is None else nearest(self.hardware),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -162,6 +186,7 @@ def read_visit(workspace: Path) -> Visit:
             )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()
+    larger = larger_photographs(case, views.views)
     paint, looks, pictures = Painter(gaussians), [], []
     for camera in cameras.cameras:
         dentition = read.get(camera.name)
@@ -177,6 +202,7 @@ def read_visit(workspace: Path) -> Visit:
             Look(
                 camera, cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), labels,
                 np.where(known, rendered.depth, 0).astype(np.float32), view.valid(),
+                larger=larger.get(camera.name),
             )
         )  # fmt: skip
     points = teeth_points(looks)

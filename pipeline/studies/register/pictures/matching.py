@@ -17,9 +17,6 @@ Array = npt.NDArray[np.float64]
 
 #: Window of the local contrast, pixels of a picture 512 wide.
 CONTRAST = 4.0
-#: Window of the contrast that is left of the marks of enamel alone, pixels of any picture: shading
-#: is smooth, marks are as sharp as the picture.
-MARKS = 1.5
 #: Highlights: brighter than what is beside them by this (0..1), and half as wide (pixels) at most.
 SHINE, SHINE_SIZE = 0.08, 6
 #: Pixels around a crown that move with it when pictures are laid over each other.
@@ -95,7 +92,6 @@ class Prepared:
     Attributes:
         look: the photograph.
         contrast: [H, W] uint8, locally normalised.
-        marks: [H, W] uint8, the same over as few pixels as may be.
         owner: [H, W] uint8 the tooth whose motion a pixel shares, 0: none's.
         core: [H, W] uint8 the tooth well inside whose crown a pixel lies.
         tensor: [H, W, 2, 2] structure tensor of `contrast`.
@@ -103,7 +99,6 @@ class Prepared:
 
     look: Look
     contrast: npt.NDArray[np.uint8]
-    marks: npt.NDArray[np.uint8]
     owner: Labels
     core: Labels
     tensor: Floats
@@ -116,7 +111,7 @@ def prepare(look: Look) -> Prepared:
     scale = max(look.image.shape) / 512
     dull, shiny = without_shine(look.without_hardware, scale)
     gray = np.clip(np.rint(dull * 255), 0, 255).astype(np.uint8)
-    contrast, marks = local_contrast(gray, CONTRAST * scale), local_contrast(gray, MARKS)
+    contrast = local_contrast(gray, CONTRAST * scale)
     labels = look.enamel
     distance, nearest = cv2.distanceTransformWithLabels(
         (labels == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
@@ -124,12 +119,31 @@ def prepare(look: Look) -> Prepared:
     of_label = np.zeros(int(nearest.max()) + 1, np.uint8)
     of_label[nearest[labels > 0]] = labels[labels > 0]
     owner = np.where(distance <= AROUND * scale, of_label[nearest], 0).astype(np.uint8)
-    core = np.zeros_like(labels)
+    core = cores(look, shiny, inside_crowns(labels))
+    return Prepared(look, contrast, owner, core, structure(contrast))
+
+
+def inside_crowns(labels: Labels) -> Floats:
+    """[H, W] pixels from each pixel of a crown to where the crown ends; 0 beside crowns."""
+    found = np.zeros(labels.shape, np.float32)
     for number in (int(n) for n in np.unique(labels) if n):
-        inside = cv2.distanceTransform((labels == number).astype(np.uint8), cv2.DIST_L2, 5)
-        core[inside > INSET * scale] = number
-    core[(look.depth <= 0) | ~look.valid | shiny] = 0
-    return Prepared(look, contrast, marks, owner, core, structure(contrast))
+        crown = (labels == number).astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(crown)
+        around = slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
+        found[around] += cv2.distanceTransform(crown[around], cv2.DIST_L2, 5)
+    return found
+
+
+def cores(look: Look, shiny: npt.NDArray[np.bool_], inside: Floats) -> Labels:
+    """[H, W] the tooth well inside whose crown a pixel lies, where its depth is known.
+
+    Args:
+        look: the photograph.
+        shiny: [H, W] highlights.
+        inside: [H, W] see `inside_crowns`.
+    """
+    sure = (inside > INSET * max(inside.shape) / 512) & (look.depth > 0) & look.valid & ~shiny
+    return np.where(sure, look.enamel, 0).astype(np.uint8)
 
 
 def without_shine(image: Floats, scale: float) -> tuple[Floats, npt.NDArray[np.bool_]]:

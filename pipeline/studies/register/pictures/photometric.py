@@ -6,14 +6,14 @@ badly it is tried from several turns and shifts; the correlation over all pairs 
 chooses.
 
 What contrast over several pixels takes along is shading, which stays with the light when a tooth
-turns. Within a pixel or two it is marks of the enamel (`Marks`): they tell turns, once a crown is
-found to a pixel.
+turns; see `marks` for what does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,9 +21,9 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.studies.register import solving
-from pipeline.studies.register.matching import GREY, Prepared, Spots
+from pipeline.studies.register.pictures.matching import GREY, Prepared, Spots
 from pipeline.studies.register.solving import State
-from pipeline.studies.register.visit import Floats
+from pipeline.studies.register.visit import Floats, Labels, Look
 
 Array = npt.NDArray[np.float64]
 
@@ -38,8 +38,6 @@ FITS, CLEARLY = 0.6, 0.05
 #: Blur of the pictures, pixels of one 512 wide, and steps with each.
 COARSE_TO_FINE = ((2.0, 6), (1.0, 5))
 FINE = len(COARSE_TO_FINE) - 1
-#: Blur of the finest contrast, pixels of any picture.
-MARK_BLURS = (1.0, 0.4)
 #: Points of a crown in each pair, and how few are too few.
 POINTS, LEAST, PAIRS = 250, 40, 12
 #: So many points side by side say the same: contrast reaches over several pixels.
@@ -86,25 +84,37 @@ class Fit:
     information: Array
 
 
+class Crowns(Protocol):
+    """A photograph, and [H, W] the tooth well inside whose crown a pixel lies."""
+
+    @property
+    def look(self) -> Look: ...
+    @property
+    def core(self) -> Labels: ...
+
+
 class Pictures:
-    """Blurred contrast of a visit's photographs and its derivatives, made once."""
+    """Blurred contrast of a visit's photographs and its derivatives, made once.
 
-    def __init__(self, prepared: Sequence[Prepared]) -> None:
-        self.prepared = prepared
-        self.made = [tuple(_with_slopes(level) for level in self.levels(p)) for p in prepared]
+    Args:
+        crowns: the photographs.
+        contrasts: [H, W] uint8 of each.
+        blurs: the levels, from the most blurred one on, in pixels.
+    """
 
-    def levels(self, prepared: Prepared) -> list[Floats]:
-        """A photograph's contrast at each level, [H, W], from the most blurred one on."""
-        scale = max(prepared.contrast.shape) / 512
-        return [blurred(prepared.contrast, sigma * scale) for sigma, _ in COARSE_TO_FINE]
+    def __init__(
+        self, crowns: Sequence[Crowns], contrasts: Sequence[npt.NDArray[np.uint8]],
+        blurs: Sequence[float],
+    ) -> None:  # fmt: skip
+        self.crowns = crowns
+        self.made = [tuple(_with_slopes(blurred(c, s)) for s in blurs) for c in contrasts]
 
 
-class Marks(Pictures):
-    """The finest contrast of a visit's photographs, and its derivatives."""
-
-    def levels(self, prepared: Prepared) -> list[Floats]:
-        """Blurred a little, and hardly."""
-        return [blurred(prepared.marks, sigma) for sigma in MARK_BLURS]
+def pictures_of(prepared: Sequence[Prepared]) -> Pictures:
+    """The contrast that optical flow goes by, at the levels of `COARSE_TO_FINE`."""
+    scale = max((max(p.contrast.shape) for p in prepared), default=0) / 512
+    contrasts = [p.contrast for p in prepared]
+    return Pictures(prepared, contrasts, [sigma * scale for sigma, _ in COARSE_TO_FINE])
 
 
 def blurred(contrast: npt.NDArray[np.uint8], sigma: float) -> Floats:
@@ -133,7 +143,8 @@ def facings(
     found, sizes = [], []
     motion = state.motions[tooth]
     for i, j in pairs:
-        one, other, camera = a.prepared[i], b.prepared[j], state.cameras[j]
+        one, other = a.crowns[i], b.crowns[j]
+        camera = state.cameras[j].resized(*other.core.shape[::-1])
         crown = one.core == tooth
         if crown.sum() < LEAST:
             continue
@@ -203,15 +214,6 @@ def contrast_spots(facing: Facing, level: int, motion: Array) -> Spots | None:
         slope[:, :, None] * slope[:, None, :] / (max(unlike, 0.05) * ALIKE),
         1 - unlike / 2, int(clear.sum()),
     )  # fmt: skip
-
-
-def mark_spots(views: Sequence[Facing], level: int, state: State) -> list[Spots]:
-    """What the marks of crowns say at a state (see `contrast_spots`)."""
-    made = (
-        contrast_spots(replace(v, camera=state.cameras[v.second]), level, state.motions[v.tooth])
-        for v in views
-    )
-    return [spots for spots in made if spots is not None]
 
 
 def score(views: Sequence[Facing], level: int, motion: Array) -> float:
@@ -290,7 +292,7 @@ def searched(
         centres: of all teeth. axes: of all teeth (see `movement.tooth_axes`).
         pairs: which photographs are compared (see `matching.pairs_of`).
     """
-    a, b = Pictures(first), Pictures(second)
+    a, b = pictures_of(first), pictures_of(second)
     found = {}
     for tooth in sorted(state.motions):
         views = facings(tooth, a, b, state, pairs)
@@ -323,7 +325,7 @@ def judged(
         first, second, state, centres, pairs: as for `searched`.
         still: teeth that stood still; their motion stays.
     """
-    a, b = Pictures(first), Pictures(second)
+    a, b = pictures_of(first), pictures_of(second)
     better, likeness = {}, {}
     for tooth, motion in sorted(state.motions.items()):
         views = facings(tooth, a, b, state, pairs)

@@ -1,0 +1,1 @@
+"""What the photographs of two visits show of a tooth: where its spots are in either."""
