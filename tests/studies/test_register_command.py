@@ -17,7 +17,7 @@ from pipeline.artifacts.space.scale import Scale
 from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.studies.register import comparing, run_register, solving
-from pipeline.studies.register.visit import Visit, names_of, read_visit
+from pipeline.studies.register.visit import Visit, names_of, read_visit, warning_of
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
 
@@ -132,6 +132,12 @@ def test_photographs_that_both_visits_hold_are_named(
         assert f"of {named}, byte for byte" in page.read_text()
         warning = json.loads((tmp_path / "out" / "register.json").read_text())["warning"]
         assert warning == said.splitlines()[0]
+
+
+def test_photographs_that_can_not_be_read_again_are_named() -> None:
+    visit = replace(toy_visit("first"), lost=("a.jpg", "b.jpg"))
+    said = warning_of(visit, toy_visit("second"))
+    assert said.startswith("a.jpg, b.jpg of 'first' can't be read where the run read them")
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_the_work(

@@ -54,7 +54,8 @@ def agrees(large: np.ndarray, view: View) -> bool:
 def test_photographs_are_read_with_more_pixels(case: Any, tmp_path: Path) -> None:
     views = views_of(tmp_path)
     views[1] = views[1].mirrored()
-    found = larger_photographs(case, views)
+    found, lost = larger_photographs(case, views)
+    assert not lost
     assert sorted(found) == ["000", "001"]
     assert all(found[view.name].shape == (LARGEST * 3 // 4, LARGEST) for view in views)
     assert all(agrees(found[view.name], view) for view in views)
@@ -63,16 +64,17 @@ def test_photographs_are_read_with_more_pixels(case: Any, tmp_path: Path) -> Non
 def test_what_has_changed_or_is_gone_is_left_out(case: Any, tmp_path: Path) -> None:
     views = views_of(tmp_path)
     cv2.imwrite(str(tmp_path / "p1.png"), scene(3, 1600, 1200))
-    assert list(larger_photographs(case, views)) == ["001"]
+    found, lost = larger_photographs(case, views)
+    assert (list(found), lost) == (["001"], ("p1.png",))
     (tmp_path / "p2.png").unlink()
-    assert larger_photographs(case, views) == {}
+    assert larger_photographs(case, views) == ({}, ("p1.png", "p2.png"))
     case.request["images"] = [str(tmp_path / "nowhere")]
-    assert larger_photographs(case, views) == {}
+    assert larger_photographs(case, views) == ({}, ("p1.png", "p2.png"))
 
 
 def test_what_has_no_more_pixels_is_not_read(case: Any, tmp_path: Path) -> None:
     case.request["images"] = [str(tmp_path / "nowhere")]
-    assert larger_photographs(case, [View("000", np.zeros((60, 80, 3), np.float32))]) == {}
+    assert larger_photographs(case, [View("000", np.zeros((60, 80, 3), np.float32))]) == ({}, ())
 
 
 def test_frames_of_a_film_are_read_with_more_pixels(tmp_path: Path) -> None:
@@ -84,6 +86,7 @@ def test_frames_of_a_film_are_read_with_more_pixels(tmp_path: Path) -> None:
     items = load_video("film.mp4", path, None, Wanted(3), SMALL, 64)
     views = [view_of(item, f"00{k}") for k, item in enumerate(items)]
     case: Any = SimpleNamespace(request={"images": [str(path)]}, settings={})
-    found = larger_photographs(case, views[1:])
+    found, lost = larger_photographs(case, views[1:])
+    assert not lost
     assert sorted(found) == ["001", "002"]
     assert all(found[v.name].shape == (480, 640) and agrees(found[v.name], v) for v in views[1:])

@@ -117,6 +117,7 @@ class Visit:
         covered: FDI number -> [3] middle of a crown with the hardware on it; none without braces.
         files: hash -> name of each file that its photographs were read from.
         labels: how pages call its photographs, by their names.
+        lost: files of photographs that have more pixels, and are not as the run read them.
     """
 
     name: str
@@ -129,6 +130,7 @@ class Visit:
     covered: Mapping[int, Array] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+    lost: tuple[str, ...] = ()
 
     @property
     def scale_doubt(self) -> float:
@@ -186,7 +188,7 @@ def read_visit(workspace: Path) -> Visit:
             )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()
-    larger = larger_photographs(case, views.views)
+    larger, lost = larger_photographs(case, views.views)
     paint, looks, pictures = Painter(gaussians), [], []
     for camera in cameras.cameras:
         dentition = read.get(camera.name)
@@ -220,7 +222,7 @@ def read_visit(workspace: Path) -> Visit:
     files = {hashed: name for name, hashed in read_from if not name.startswith(MASK_PREFIX)}
     made = Visit(
         workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians, files=files,
-        labels=case.labels,
+        labels=case.labels, lost=lost,
     )  # fmt: skip
     made = made.in_frame(frame)
     made = without_braces(made, pictures)
@@ -237,20 +239,30 @@ def names_of(workspaces: Sequence[Path]) -> list[str]:
     return names
 
 
-def said_of_shared(first: Visit, second: Visit) -> str:
-    """What has to be known where both visits hold a file; empty: they don't.
+def warning_of(first: Visit, second: Visit) -> str:
+    """What has to be known of the photographs of two visits; mostly nothing.
 
-    Of such photographs it comes out that nothing moved.
+    Of photographs that both hold it comes out that nothing moved. Of such as can't be read again
+    turns are measured in the smaller pictures of the run.
     """
+    said = []
     shared = [name for hashed, name in first.files.items() if hashed in second.files]
-    if not shared:
-        return ""
-    more = f" and {len(shared) - 4} more" if len(shared) > 4 else ""
-    return (
-        f"Both runs are of {', '.join(shared[:4])}{more}, byte for byte: what these photographs "
-        "show did not move. If one came into the wrong folder, take it out and run that visit "
-        "again."
-    )
+    if shared:
+        said.append(
+            f"Both runs are of {_some(shared)}, byte for byte: what these photographs show did not "
+            "move. If one came into the wrong folder, take it out and run that visit again."
+        )
+    said += [
+        f"{_some(visit.lost)} of '{visit.name}' can't be read where the run read them, or have "
+        "changed, so their smaller pictures of the run are compared: turns come out less exactly."
+        for visit in (first, second)
+        if visit.lost
+    ]
+    return " ".join(said)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:

@@ -15,7 +15,7 @@ from pipeline.artifacts.dental.fdi import universal_number
 from pipeline.files import write_atomic
 from pipeline.studies.register.comparing import Comparison, Moved
 from pipeline.studies.register.movement import PARTS, words
-from pipeline.studies.register.visit import Look, said_of_shared
+from pipeline.studies.register.visit import Look, warning_of
 
 Array = npt.NDArray[np.float64]
 FORMAT = "dentalsplat register 1"
@@ -46,7 +46,7 @@ def described(found: Comparison) -> dict[str, Any]:
         "first": found.first.name,
         "second": found.second.name,
         "notes": NOTES,
-        "warning": said_of_shared(found.first, found.second),
+        "warning": warning_of(found.first, found.second),
         "units": "mm",
         "scale_source": found.scale_source,
         "scale_deviation_percent": None if percent is None else round(percent, 2),

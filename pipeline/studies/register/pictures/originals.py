@@ -24,15 +24,18 @@ Floats = npt.NDArray[np.float32]
 LARGEST = 1024
 
 
-def larger_photographs(case: Case, views: Sequence[View]) -> dict[str, Floats]:
-    """View name -> [H, W] float32 grey in 0..1 of the views that can be had with more pixels.
-
-    Files that are gone, or have changed since the run, are no error: what they show is missing
-    here.
+def larger_photographs(
+    case: Case, views: Sequence[View]
+) -> tuple[dict[str, Floats], tuple[str, ...]]:
+    """Read the photographs of views that have more pixels than these.
 
     Args:
         case: a finished run.
         views: of it.
+
+    Returns:
+        View name -> [H, W] float32 grey in 0..1; the names of the files that are not what the run
+        read, or not where it read them.
     """
     wanted = {view.source_name: view for view in views if _has_more(view)}
     found = {}
@@ -45,7 +48,7 @@ def larger_photographs(case: Case, views: Sequence[View]) -> dict[str, Floats]:
         alike = abs(width * view.height - height * view.width) <= 2 * max(width, height)
         if alike and width > view.width:
             found[view.name] = np.ascontiguousarray(grey[:, ::-1]) if view.turned_over else grey
-    return found
+    return found, tuple(name for name, view in wanted.items() if view.name not in found)
 
 
 def _has_more(view: View) -> bool:
