@@ -82,6 +82,15 @@ class Look:
         """[H, W, 3] what each pixel sees, mm; meaningless where depth is 0."""
         return self.camera.unproject(self.depth)
 
+    def points_at(self, where: npt.NDArray[np.bool_]) -> Array:
+        """[N, 3] what pixels see, mm, of those marked in [H, W]."""
+        row, column = np.nonzero(where)
+        z = self.depth[row, column].astype(np.float64)
+        x = (column + 0.5 - self.camera.cx) / self.camera.fx * z
+        y = (row + 0.5 - self.camera.cy) / self.camera.fy * z
+        local = np.stack([x, y, z], -1) - self.camera.translation
+        return np.asarray(local @ self.camera.rotation)
+
     @property
     def enlarged(self) -> Look:
         """The photograph with all the pixels that are at hand."""

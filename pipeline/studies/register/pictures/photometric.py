@@ -59,8 +59,10 @@ class Facing:
         points: [N, 3] of the first visit's crown, mm.
         values: per blur, [N] contrast in the first photograph, mean 0 and deviation 1.
         pictures: per blur, [H, W, 3] contrast of the second photograph and its derivatives.
-        crown: [H, W] 1 where the second photograph shows the crown, 0 beside it.
-        clear: [H, W] 1 well inside it and without highlights.
+        crown: [h, w] 1 where the second photograph shows the crown, 0 beside it: the part of it
+            that begins at `corner`. There is no crown around it.
+        clear: [h, w] 1 well inside it and without highlights.
+        corner: column and row.
         camera: of the second photograph.
     """
 
@@ -72,6 +74,7 @@ class Facing:
     pictures: tuple[Floats, ...]
     crown: Floats
     clear: Floats
+    corner: tuple[int, int]
     camera: Camera
 
 
@@ -148,7 +151,7 @@ def facings(
         crown = one.core == tooth
         if crown.sum() < LEAST:
             continue
-        points = one.look.points[crown]
+        points = one.look.points_at(crown)
         pixels, z = camera.project(points @ motion[:3, :3].T + motion[:3, 3])
         column, row = np.floor(pixels).astype(int).T
         inside = (
@@ -165,7 +168,15 @@ def facings(
         kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), most_points)).astype(int)]
         clear = ((other.core > 0) & (theirs > 0)).astype(np.float32)
         values = tuple(level[..., 0][crown][kept].astype(np.float64) for level in a.made[i])
-        found.append(Facing(tooth, i, j, points[kept], values, b.made[j], theirs, clear, camera))
+        left, top, width, height = cv2.boundingRect(theirs.astype(np.uint8))
+        left, top = max(left - 1, 0), max(top - 1, 0)
+        part = slice(top, top + height + 2), slice(left, left + width + 2)
+        found.append(
+            Facing(
+                tooth, i, j, points[kept], values, b.made[j],
+                theirs[part].copy(), clear[part].copy(), (left, top), camera,
+            )
+        )  # fmt: skip
         sizes.append(int(crown.sum()))
     return [found[k] for k in np.argsort(sizes, kind="stable")[::-1][:most]]
 
@@ -180,6 +191,7 @@ def _sampled(facing: Facing, level: int, motion: Array) -> tuple[Array, Array, A
     pixels, z = facing.camera.project(facing.points @ motion[:3, :3].T + motion[:3, 3])
     x, y = np.where(z > 1, pixels.T - 0.5, -9).astype(np.float32)[:, None]
     value = cv2.remap(facing.pictures[level], x, y, cv2.INTER_LINEAR)[0]
+    x, y = x - facing.corner[0], y - facing.corner[1]
     crown = cv2.remap(facing.crown, x, y, cv2.INTER_LINEAR)[0]
     clear = cv2.remap(facing.clear, x, y, cv2.INTER_LINEAR)[0] > 0.5
     return pixels, value.astype(np.float64), crown, clear
