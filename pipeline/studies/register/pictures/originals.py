@@ -75,8 +75,7 @@ def _loaded(case: Case, names: Sequence[str]) -> Sequence[Any]:
             return load_video(
                 first, files[first], None, wanted, LARGEST, least, cut, usable_cores()
             )
-        sources = {name if name in files else name.rpartition("#")[0] for name in names}
-        used = {label: path for label, path in files.items() if label in sources}
-        return load_photos(used, {}, LARGEST, least, cut, usable_cores()) if used else []
+        # All of them, as the run did: how a picture is cut hangs on whether it is the only one.
+        return load_photos(files, {}, LARGEST, least, cut, usable_cores())
     except (RequestError, OSError):
         return []
