@@ -26,7 +26,7 @@ _DIS_PRESETS = {
 _SMALLEST_SIDE = 16
 
 
-def local_contrast(gray: Gray, sigma: float) -> Gray:
+def local_contrast(gray: Gray, sigma: float, among: npt.NDArray[np.bool_] | None = None) -> Gray:
     """Take out brightness and contrast that vary slowly: (I - mean) / (deviation + 4), 8 bits.
 
     The flash moves with the camera, so shading slides over the surface; on teeth, which have
@@ -35,14 +35,19 @@ def local_contrast(gray: Gray, sigma: float) -> Gray:
     Args:
         gray: [H, W] uint8.
         sigma: of the Gaussian window for mean and deviation, in pixels; 0 leaves the image alone.
+        among: [H, W] the pixels that count, beside which there is no contrast; None: all.
     """
     if sigma <= 0:
         return gray
     image = gray.astype(np.float32)
-    mean = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma))
-    variance = np.asarray(cv2.GaussianBlur(image * image, (0, 0), sigma)) - mean * mean
+    weight, mass = np.ones_like(image), np.ones_like(image)
+    if among is not None:
+        weight = among.astype(np.float32)
+        mass = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
+    mean = np.asarray(cv2.GaussianBlur(image * weight, (0, 0), sigma)) / mass
+    square = np.asarray(cv2.GaussianBlur(image * image * weight, (0, 0), sigma)) / mass
     # 4 grey levels: where only noise is left, it must not be blown up to full contrast.
-    normal = (image - mean) / (np.sqrt(np.maximum(variance, 0)) + 4)
+    normal = weight * (image - mean) / (np.sqrt(np.maximum(square - mean * mean, 0)) + 4)
     return np.clip(np.rint(128 + 40 * normal), 0, 255).astype(np.uint8)
 
 

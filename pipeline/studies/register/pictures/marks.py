@@ -11,12 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.studies.register.pictures.matching import (
-    GREY,
     Spots,
     cores,
     inside_crowns,
@@ -24,15 +22,13 @@ from pipeline.studies.register.pictures.matching import (
 )
 from pipeline.studies.register.pictures.photometric import Facing, Pictures, contrast_spots
 from pipeline.studies.register.solving import State
-from pipeline.studies.register.visit import Floats, Labels, Look
+from pipeline.studies.register.visit import Labels, Look
 
 #: Window of the contrast, pixels of any picture: marks are as sharp as the picture.
 WINDOW = 2.0
 #: So many pixels of a picture 512 wide beside its outline a crown's picture is blurred by what is
 #: there.
 EDGE = 1.0
-#: Grey levels (of 255) that count as no contrast: noise.
-NOISE = 4.0
 #: Blur of the contrast, pixels of any picture: a little, and hardly.
 BLURS = (1.0, 0.4)
 
@@ -52,36 +48,16 @@ class Marked:
 
 def marked(look: Look) -> Marked:
     """Find the marks in a photograph."""
+    from stages.flow.estimate import local_contrast
+
     look = look.enlarged
     scale = max(look.image.shape) / 512
     picture = look.without_hardware
     _, shiny = without_shine(picture, scale)
     inside = inside_crowns(look.enamel)
     shown = (inside > EDGE * scale) & look.valid & ~shiny
-    return Marked(look, cores(look, shiny, inside), contrast_among(picture, shown, WINDOW))
-
-
-def contrast_among(
-    picture: Floats, shown: npt.NDArray[np.bool_], sigma: float
-) -> npt.NDArray[np.uint8]:
-    """[H, W] local contrast (see `stages.flow.estimate.local_contrast`) of some pixels alone.
-
-    Args:
-        picture: [H, W] grey, 0..1.
-        shown: [H, W] the pixels that count; beside them there is none.
-        sigma: of the Gaussian window, pixels.
-    """
-    weight = shown.astype(np.float32)
-    image = 255 * picture
-
-    def mean_of(values: Floats) -> Floats:
-        return np.asarray(cv2.GaussianBlur(values * weight, (0, 0), sigma) / mass, np.float32)
-
-    mass = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-    mean = mean_of(image)
-    deviation = np.sqrt(np.maximum(mean_of(image * image) - mean * mean, 0))
-    normal = np.where(shown, (image - mean) / (deviation + NOISE), 0)
-    return np.clip(np.rint(GREY + 40 * normal), 0, 255).astype(np.uint8)
+    gray = np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8)
+    return Marked(look, cores(look, shiny, inside), local_contrast(gray, WINDOW, shown))
 
 
 def marks_of(looks: Sequence[Look]) -> Pictures:
