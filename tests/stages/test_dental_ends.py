@@ -11,8 +11,18 @@ import pytest
 
 from pipeline.artifacts.dental.fdi import JAWS
 from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS
-from stages.init.dental.numbering.ends import MOST_COST, end_labels, ends_cost, hidden_at_ends
-from stages.init.dental.numbering.hypotheses import row_defects, row_pairs
+from stages.init.dental.numbering.labellings.ends import (
+    MOST_COST,
+    end_labels,
+    ends_cost,
+    hidden_at_ends,
+)
+from stages.init.dental.numbering.labellings.scorer import (
+    row_defects,
+)
+from stages.init.dental.numbering.labellings.search import (
+    row_pairs,
+)
 from stages.init.dental.numbering.sightings import SeenRow
 from stages.init.dental.template import LANDMARKS_A_JAW, PAPILLA, ZENITH
 

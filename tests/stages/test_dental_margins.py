@@ -10,8 +10,11 @@ from typing import Any, cast
 import pytest
 
 from stages.dentition.overlay import DOUBT_SHOWN
-from stages.init.dental.numbering.edits import shifted_labellings
-from stages.init.dental.numbering.hypotheses import Labelling, Scored
+from stages.init.dental.numbering.labellings.edits import shifted_labellings
+from stages.init.dental.numbering.labellings.scorer import (
+    Labelling,
+    Scored,
+)
 from stages.init.dental.numbering.rivals import (
     LEAST_DOUBT,
     NEAR_DOUBT,

@@ -20,7 +20,11 @@ from stages.init.config import InitConfig
 from stages.init.dental.cameras.held import HeldCameras, held_cameras
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.hypotheses import Labelling, Scorer, ViewLabels
+from stages.init.dental.numbering.labellings.scorer import (
+    Labelling,
+    Scorer,
+    ViewLabels,
+)
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence, mirrored_labels
 from stages.init.dental.numbering.sightings import seen_rows
 from stages.init.dental.surface.options import SurfaceOptions

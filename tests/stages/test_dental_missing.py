@@ -11,8 +11,10 @@ import numpy as np
 from pipeline.artifacts.dental.fdi import is_upper
 from stages.init.dental.cameras.bundle import ARCH_CENTRE, nominal_rotation
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.edits import missing_tooth_edits, with_row
-from stages.init.dental.numbering.hypotheses import Labelling
+from stages.init.dental.numbering.labellings.edits import missing_tooth_edits, with_row
+from stages.init.dental.numbering.labellings.scorer import (
+    Labelling,
+)
 from stages.init.dental.template import position_of
 
 OPTIONS = ArchOptions()

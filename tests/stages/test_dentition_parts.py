@@ -22,7 +22,9 @@ from stages.dentition.tooth_rows import (
 )
 from stages.init.dental.mirror_images import Turned
 from stages.init.dental.numbering.arch import ArchOptions, fit_arch
-from stages.init.dental.numbering.hypotheses import row_defects
+from stages.init.dental.numbering.labellings.scorer import (
+    row_defects,
+)
 from stages.init.dental.numbering.sightings import SightingCache, row_landmarks, seen_rows
 from stages.init.dental.reconstruct import with_whole_crowns
 from stages.init.dental.solution import ArchFit, PlacedView

@@ -1,7 +1,7 @@
 """Which tooth is which and where the cameras are, from the crowns in a few wide photographs.
 
 The teeth are the landmarks, a textbook arch is the prior: labellings are compared by evidence
-(`hypotheses`, `edits`), near ones by how the pictures match on the unrolled arch (`rivals`,
+(`labellings`), near ones by how the pictures match on the unrolled arch (`rivals`,
 `matching`), the best one is refined with these matches, and what speaks against it is said
 (`confidence`).
 """
@@ -31,7 +31,7 @@ from stages.init.dental.numbering.confidence import (
     plain_role,
     role_doubts,
 )
-from stages.init.dental.numbering.edits import (
+from stages.init.dental.numbering.labellings.edits import (
     MIN_GAIN,
     Fixed,
     common_mouth,
@@ -39,10 +39,12 @@ from stages.init.dental.numbering.edits import (
     settle_ends,
     solve_shifted,
 )
-from stages.init.dental.numbering.hypotheses import (
+from stages.init.dental.numbering.labellings.scorer import (
     MAIN_ROLES,
     Scored,
     Scorer,
+)
+from stages.init.dental.numbering.labellings.search import (
     roles_of_view,
     search,
     view_candidates,

@@ -15,7 +15,11 @@ from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance
-from stages.init.dental.numbering.hypotheses import MAIN_ROLES, Scored, Scorer
+from stages.init.dental.numbering.labellings.scorer import (
+    MAIN_ROLES,
+    Scored,
+    Scorer,
+)
 from stages.init.dental.numbering.mirrored import PERHAPS_MIRRORED
 from stages.init.dental.numbering.rivals import Margins
 

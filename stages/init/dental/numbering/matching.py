@@ -21,7 +21,11 @@ from stages.init.dental.cameras.unrolled import (
     prepare_photo,
 )
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.hypotheses import Labelling, Scored, Scorer
+from stages.init.dental.numbering.labellings.scorer import (
+    Labelling,
+    Scored,
+    Scorer,
+)
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

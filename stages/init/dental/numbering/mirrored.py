@@ -12,7 +12,7 @@ from dataclasses import replace
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.crowns import mirrored_dentition
 from stages.dentition.tooth_rows import NO_TOOTH, POSITIONS
-from stages.init.dental.numbering.hypotheses import (
+from stages.init.dental.numbering.labellings.scorer import (
     Labelling,
     Scored,
     Scorer,

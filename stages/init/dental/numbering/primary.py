@@ -23,7 +23,12 @@ from stages.dentition.changing_teeth import (
     said_numbers,
 )
 from stages.dentition.tooth_rows import NO_TOOTH
-from stages.init.dental.numbering.hypotheses import SEARCH_STEPS, Labelling, Scored, Scorer
+from stages.init.dental.numbering.labellings.scorer import (
+    SEARCH_STEPS,
+    Labelling,
+    Scored,
+    Scorer,
+)
 from stages.init.dental.template import tooth_at
 
 #: The permanent numbers in whose place a primary tooth can stand.

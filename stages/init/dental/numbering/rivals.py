@@ -15,7 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.dentition.tooth_rows import NO_TOOTH
-from stages.init.dental.numbering.hypotheses import Labelling, Scored, ViewLabels
+from stages.init.dental.numbering.labellings.scorer import (
+    Labelling,
+    Scored,
+    ViewLabels,
+)
 
 Doubts = tuple[float, ...]
 

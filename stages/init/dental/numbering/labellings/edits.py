@@ -13,8 +13,8 @@ from stages.dentition.row_edits import bounded, row_edits, shifted
 from stages.dentition.tooth_rows import POSITIONS, Labels
 from stages.init.dental.cameras.bundle import Adjusted, adjust, view_angles
 from stages.init.dental.cameras.kernels import PER_ARCH, PER_VIEW
-from stages.init.dental.numbering.ends import end_labels, ends_cost
-from stages.init.dental.numbering.hypotheses import (
+from stages.init.dental.numbering.labellings.ends import end_labels, ends_cost
+from stages.init.dental.numbering.labellings.scorer import (
     FINAL_STEPS,
     SEARCH_STEPS,
     Labelling,

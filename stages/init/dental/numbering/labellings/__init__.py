@@ -1,0 +1,1 @@
+"""Hypotheses about which tooth is which: made, solved, scored, searched, edited."""
