@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from hypothesis import settings
 
 import pipeline
 from pipeline.running.outcomes import RunSummary
@@ -19,6 +20,10 @@ SHORT = {
     "export.video_seconds": 1,
     "export.mesh_faces": 5000,
 }
+
+# How long an example takes is the machine's affair, which may be busy.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")
