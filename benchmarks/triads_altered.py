@@ -26,6 +26,8 @@ Rng = np.random.Generator
 Altered = tuple[Floats, Floats]
 #: A truth point nearer to the border than this share of the picture is left out.
 MARGIN = 0.01
+#: Of linear sRGB.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def _linear(image: Floats) -> Floats:
@@ -109,8 +111,15 @@ def over(image: Floats, rng: Rng) -> Altered:
     return image[::-1, ::-1], np.array([[-1.0, 0, width], [0, -1, height]])
 
 
+def grey(image: Floats, rng: Rng) -> Altered:
+    """Black and white."""
+    light = _linear(image) @ LUMINANCE
+    return np.repeat(_encoded(light)[..., None], 3, axis=2), np.eye(2, 3)
+
+
 SORTS: dict[str, Callable[[Floats, Rng], Altered]] = {
-    made.__name__: made for made in (balance, exposure, turned, cut, small, soft, everything, over)
+    made.__name__: made
+    for made in (balance, exposure, turned, cut, small, soft, everything, over, grey)
 }
 
 

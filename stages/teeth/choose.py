@@ -12,6 +12,7 @@ import numpy.typing as npt
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.corrections import SIDES, area, says_side, shows_less
 from stages.teeth.config import TeethConfig
+from stages.teeth.grey import chroma
 from stages.teeth.read import Reading, row_extent
 
 Array32 = npt.NDArray[np.float32]
@@ -63,7 +64,7 @@ def _unusable(reading: Reading, image: Array32, config: TeethConfig) -> str:
     """Why a photograph by itself can't be used; empty: it can."""
     dentition = reading.dentition
     if chroma(image) < config.least_colour:
-        return "it has no colour: an X-ray, or not a photograph"
+        return "it has no colour, as others have: an X-ray, or not a photograph"
     count = len(dentition.all_crowns)
     if count < config.least_crowns:
         return f"no row of teeth was found in it ({count} crown{'s' * (count != 1)})"
@@ -99,13 +100,6 @@ def usual_score(dentition: Dentition) -> float:
     order = np.argsort(scores)
     below = np.cumsum(np.array(areas)[order])
     return float(scores[order][np.searchsorted(below, below[-1] / 2)])
-
-
-def chroma(image: Array32) -> float:
-    """Mean distance of a picture's colours from grey (CIE ab)."""
-    small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA)
-    lab = cv2.cvtColor(np.clip(small, 0, 1), cv2.COLOR_RGB2Lab)
-    return float(np.linalg.norm(lab[..., 1:], axis=-1).mean())
 
 
 def _repeated(

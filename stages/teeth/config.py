@@ -38,7 +38,8 @@ class TeethConfig(StageConfig):
     )  # fmt: skip
     least_colour: float = Field(
         4.0, ge=0, le=100,
-        description="mean chroma (CIE ab) below which a photograph is an X-ray or not in colour",
+        description="mean chroma (CIE ab) below which a picture has no colour: an X-ray, or, "
+        "where all have none, a black-and-white photograph",
     )  # fmt: skip
     least_score: float = Field(
         0.9, ge=0, le=1,

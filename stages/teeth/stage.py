@@ -14,7 +14,7 @@ class TeethStage(Stage):
     """Views -> teeth."""
 
     name = "teeth"
-    version = 19
+    version = 20
     summary = "read the teeth in each photograph: crowns, jaws, numbers; set aside what is no use"
     Config = TeethConfig
     requires = ("views",)
@@ -33,10 +33,13 @@ class TeethStage(Stage):
         return {} if config.method == "none" else {"reader.onnx": WEIGHTS}
 
     def run(self, context: StageContext) -> None:
+        from dataclasses import replace
+
         from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.dentition.working import resized_dentition, working_view
         from stages.teeth.choose import choose
+        from stages.teeth.grey import chroma, tinted
         from stages.teeth.reader import PhotographReader, evenly
 
         config: TeethConfig = context.config
@@ -49,6 +52,9 @@ class TeethStage(Stage):
             spare = {*evenly([k for k in every if k not in first], config.most_views)}
         asked = sorted({*first, *spare})
         working = [working_view(views[k]) for k in asked]
+        grey = all(chroma(view.image) < config.least_colour for view in working)
+        if grey:  # with others in colour, one that has none is an X-ray
+            working = [replace(view, image=tinted(view.image)) for view in working]
         reader = PhotographReader(working, context.threads)
         places = list(range(len(asked)))
         if config.method == "auto":
@@ -75,6 +81,11 @@ class TeethStage(Stage):
             for name, dentition in zip(names, dentitions, strict=True):
                 if dentition.set_aside:
                     context.warn(f"{name} is not used to place the teeth: {dentition.set_aside}.")
+        if grey and teeth.chosen:
+            context.warn(
+                "The photographs have no colour: they are read as black-and-white ones. X-rays "
+                "make no scene."
+            )
         context.save(teeth)
         crowns = [crown for view in teeth.chosen for crown in view.all_crowns]
         context.summarize(
