@@ -41,8 +41,8 @@ NOTES = {
     "width, height": "of the crown along and across its row, at its depth, in the photograph that "
     "shows most of it: it is foreshortened there, so the tooth has at least that; null: no "
     "photograph shows all of it",
-    "outline": "closed polygon in pixels of colmap/images/PHOTOGRAPH.png, x to the right, y down, "
-    "pixel centres at .5",
+    "outline": "closed polygon in pixels of the photograph as export.colmap writes it "
+    "(colmap/images/PHOTOGRAPH.png), x to the right, y down, pixel centres at .5",
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,38 +50,30 @@ DESCRIPTIONS = {
     "teeth.csv": "the same as a table, a row for each tooth",
 }
 
-TEETH = """\
-
-Teeth. teeth.json has {teeth} teeth, teeth.csv a row for each. "doubt" is the probability that a
-number is wrong; check those above .2. "centre" is the middle of what is seen of a crown, in the
-frame above. Outlines are pixels of colmap/images. Photographs that were set aside are named there,
-with the reason.
-"""
-
-MODELS = """
-Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print: both lie
-on their bases (scene.json has the matrices), so they do not bite together as mesh_upper.stl and
-mesh_lower.stl do. Their outside is the mesh. The back and the base are made up, not measured: the
-photographs do not show them.
-"""
-
-README = """\
-dentalsplat export
-==================
-
-{files}
-
-Scale. {scale}
-
-Frame. {frame}
-Axes are right-handed. Up in the photographs is ({up[0]:.4f}, {up[1]:.4f}, {up[2]:.4f}).
-Cameras in colmap/ are OpenCV cameras (x right, y down, z forward); those in transforms.json
-have OpenGL axes (x right, y up, z backward) in the same world.
-{turned}{metres}
-{teeth}{models}
-{placed} of {total} photographs could be placed. They appear as 000, 001, ... in the order in which
-they were given; no file names, places or times are carried along.
-"""
+#: Paragraphs of `README.txt`. What is not in the folder is not spoken of.
+CAMERAS = (
+    "Cameras in colmap/ are OpenCV cameras (x right, y down, z forward); those in transforms.json "
+    "have OpenGL axes (x right, y up, z backward) in the same world."
+)
+METRES = (
+    "Lengths in .glb files are in metres, as their readers expect it; in all others in millimetres."
+)
+TEETH = (
+    'Teeth: {teeth} in teeth.json, with a row for each in teeth.csv. "doubt" is the probability '
+    'that a number is wrong; check those above .2. "centre" is the middle of what is seen of a '
+    "crown, in the frame above. Outlines are pixels of the photographs as export.colmap writes "
+    "them (colmap/images). Photographs that were set aside are named there, with the reason."
+)
+MODELS = (
+    "Models. model_upper.stl and model_lower.stl are closed, with a flat base, ready to print: "
+    "both lie on their bases (scene.json has the matrices), so they do not bite together as "
+    "mesh_upper.stl and mesh_lower.stl do. Their outside is the mesh. The back and the base are "
+    "made up, not measured: the photographs do not show them."
+)
+PHOTOGRAPHS = (
+    "{placed_photographs} of {photographs} photographs could be placed. They appear as 000, 001, "
+    "... in the order in which they were given; no file names, places or times are carried along."
+)
 
 
 #: Name of a frame -> its axes, its origin, and all that for people.
@@ -90,15 +82,15 @@ FRAMES: dict[str, tuple[str, str, str]] = {
         "x to the patient's left, y up, z to the front, towards the viewer",
         "between the edges of the upper central incisors, in the occlusal plane (y = 0)",
         "All files share the frame of the mouth: x leads to the patient's left, y up, z to the "
-        "front,\ntowards the viewer. The origin lies between the edges of the upper central "
-        "incisors (or of the\nforemost pair of teeth that is seen), in the occlusal plane, which "
-        "is y = 0: the plane nearest to\nthe edges and cusps of the upper teeth.",
+        "front, towards the viewer. The origin lies between the edges of the upper central "
+        "incisors (or of the foremost pair of teeth that is seen), in the occlusal plane, which "
+        "is y = 0: the plane nearest to the edges and cusps of the upper teeth.",
     ),
     "upright": (
         "x right, y up, z towards the viewer, as the photographs show it",
         "the middle of what the photographs show",
         "All files stand as the photographs show the scene: x leads to the right, y up, z towards "
-        "the\nviewer. The origin is in the middle of what the photographs show.",
+        "the viewer. The origin is in the middle of what the photographs show.",
     ),
     "input": (
         "those of the cameras that were given",
@@ -111,14 +103,6 @@ FRAMES: dict[str, tuple[str, str, str]] = {
         "All files are in the reconstruction's own frame, and in its own units.",
     ),
 }
-TURNED = """\
-Two kinds of files are turned against that frame, as their readers expect it: splats*.ply and
-splats.sog by 180 degrees about z, for SuperSplat, and mesh*.stl by 90 degrees about x, so that z is
-up. scene.json has the matrices.
-"""
-METRES = """\
-Lengths in .glb files are in metres, as their readers expect it; in all others in millimetres.
-"""
 
 
 def describe_frame(frame: Frame) -> dict[str, Any]:
@@ -179,18 +163,46 @@ def scene_description(
 
 def readme(scene: Mapping[str, Any]) -> str:
     """The text of `README.txt`, from `scene_description`."""
-    frame = scene["frame"]
-    width = max(map(len, scene["files"]), default=0) + 2
-    lines = [f"{name:<{width}}{what}" for name, what in scene["files"].items()]
-    return README.format(
-        files="\n".join(lines),
-        scale=textwrap.fill(scene["scale"]["text"], 100, initial_indent=" " * 7)[7:],
-        frame=FRAMES[frame["name"]][2],
-        turned=TURNED if any(name.endswith(".ply") for name in frame["file_from_frame"]) else "",
-        metres=METRES if any(name.endswith(".glb") for name in frame["file_from_frame"]) else "",
-        models=MODELS if any(name.startswith("model_") for name in scene["files"]) else "",
-        up=frame["up"],
-        placed=scene["counts"]["placed_photographs"],
-        total=scene["counts"]["photographs"],
-        teeth=TEETH.format(**scene["counts"]) if "teeth" in scene["counts"] else "",
+    files, frame, counts = scene["files"], scene["frame"], scene["counts"]
+    width = max(map(len, files), default=0) + 2
+    up = "({:.4f}, {:.4f}, {:.4f})".format(*frame["up"])
+    place = [
+        f"Frame. {FRAMES[frame['name']][2]} Axes are right-handed. Up in the photographs is {up}.",
+        CAMERAS if "transforms.json" in files else "",
+        _turned(frame["file_from_frame"]),
+        METRES if any(name.endswith(".glb") for name in frame["file_from_frame"]) else "",
+    ]
+    paragraphs = [
+        f"Scale. {scene['scale']['text']}",
+        " ".join(filter(None, place)),
+        TEETH.format(**counts) if "teeth" in counts else "",
+        MODELS if any(name.startswith("model_") for name in files) else "",
+        *(f"Not made ({what}): {why}." for what, why in scene["skipped"].items()),
+        PHOTOGRAPHS.format(**counts),
+    ]
+    return (
+        "\n\n".join(
+            [
+                "dentalsplat export\n==================",
+                "\n".join(f"{name:<{width}}{what}" for name, what in files.items()),
+                *(textwrap.fill(text, 100) for text in paragraphs if text),
+            ]
+        )
+        + "\n"
+    )
+
+
+def _turned(names: Collection[str]) -> str:
+    """Which files are turned against the frame, beside closed models; "" where none is."""
+    said = []
+    if any(name.startswith("splats") for name in names):
+        also = " and splats.sog" if "splats.sog" in names else ""
+        said.append(f"splats*.ply{also} by 180 degrees about z, for SuperSplat")
+    if any(name.startswith("mesh") and name.endswith(".stl") for name in names):
+        said.append("mesh*.stl by 90 degrees about x, so that z is up")
+    if not said:
+        return ""
+    return (
+        "Some files are turned against that frame, as their readers expect it: "
+        f"{', and '.join(said)}. scene.json has the matrices."
     )

@@ -326,6 +326,20 @@ def test_points_are_optional_and_views_may_differ_in_size(tmp_path: Path) -> Non
     assert description["frame"]["name"] == "upright"
 
 
+def test_the_readme_speaks_of_what_is_there(tmp_path: Path) -> None:
+    """And of what was asked for and is not; not of folders and files that nobody asked for."""
+    case = scene.ball_case()
+    case["points"] = case["points"][np.arange(20)]
+    case["cameras"] = replace(case["cameras"], mouth_from_world=np.diag([1.0, -1, -1, 1]))
+    less = {"colmap": False, "splat_files": False, "video": False, "preview": False}
+    export(tmp_path, inputs=case, **less)
+    text = " ".join((tmp_path / "exports" / "README.txt").read_text().split())
+    assert "splats*.ply by 180 degrees about z, for SuperSplat. scene.json has the matrices" in text
+    assert "Not made (mesh): too little surface for a mesh." in text
+    for absent in ("colmap", "transforms.json", "mesh*.stl", "splats.sog", ".glb", "teeth.json"):
+        assert absent not in text
+
+
 def test_without_cameras_it_says_so(tmp_path: Path) -> None:
     case = scene.ball_case()
     case["cameras"] = Cameras(())

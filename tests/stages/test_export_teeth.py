@@ -172,7 +172,7 @@ def test_it_is_described(folder: Path) -> None:
     description = json.loads((folder / "scene.json").read_text())
     assert "teeth.json" in description["files"]
     assert description["counts"]["teeth"] == 2
-    assert "teeth.json has 2 teeth" in (folder / "README.txt").read_text()
+    assert "Teeth: 2 in teeth.json" in (folder / "README.txt").read_text()
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, folder: Path) -> None:
