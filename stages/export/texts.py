@@ -165,7 +165,7 @@ def readme(scene: Mapping[str, Any]) -> str:
     """The text of `README.txt`, from `scene_description`."""
     files, frame, counts = scene["files"], scene["frame"], scene["counts"]
     width = max(map(len, files), default=0) + 2
-    up = "({:.4f}, {:.4f}, {:.4f})".format(*frame["up"])
+    up = "({:.4f}, {:.4f}, {:.4f})".format(*(round(x, 4) + 0.0 for x in frame["up"]))
     place = [
         f"Frame. {FRAMES[frame['name']][2]} Axes are right-handed. Up in the photographs is {up}.",
         CAMERAS if "transforms.json" in files else "",

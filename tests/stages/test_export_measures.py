@@ -158,7 +158,8 @@ def test_sides_are_the_patients() -> None:
 
 def test_a_shift_of_nothing_has_no_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     midline = next(rule for rule in measures.RULES if rule.name == "midline_shift")
-    for shift, said in ((0.02, ""), (0.08, midline.signs[0]), (-0.08, midline.signs[1])):
+    to_left, to_right = midline.signs
+    for shift, said in ((0.02, ""), (0.049, ""), (0.05, to_left), (-0.08, to_right)):
         rule = replace(midline, measure=lambda places, axes, mm=shift: (mm, np.zeros((2, 3))))
         monkeypatch.setattr(measures, "RULES", (rule,))
         assert measured(grown(3, midline=2.5))["midline_shift"]["direction"] == said

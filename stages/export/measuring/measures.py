@@ -38,8 +38,9 @@ DRAWS = 100
 _WIDE = 1.96
 #: Sure and fair: the uncertainty is under this share of the distance between neighbouring crowns.
 _SURE, _FAIR = 0.08, 0.25
-#: So much (of the same distance) is nothing, and has no direction: .05 mm.
-_NOTHING = 0.006
+#: Less than this, which pages show as 0.0 mm, is nothing, and has no direction; without a scale
+#: this share of the same distance is.
+_NOTHING_MM, _NOTHING = 0.05, 0.006
 #: Above this doubt of a number the value is of no use.
 MOST_DOUBT = 0.5
 #: A row of crowns this much flatter than long has no plane of its own.
@@ -141,11 +142,12 @@ def _measured(
     values = [rule.measure(places_of(draw, teeth), turned)[0] for draw, turned in draws]
     share = rule.stands_for * (rule.covered if covered else 1.0)
     spacing = spacing_of(places)
+    nothing = _NOTHING_MM if scale.unit == "mm" else _NOTHING * spacing
     off = [float(np.std(values)), share * spacing, value * scale.counted_percent / 100]
     return {
         "value": _rounded(value),
         "uncertainty": _rounded(_WIDE * float(np.linalg.norm(off))),
-        "direction": rule.signs[0 if value >= 0 else 1] if abs(value) > _NOTHING * spacing else "",
+        "direction": rule.signs[0 if value >= 0 else 1] if abs(value) >= nothing else "",
         "points": [[_rounded(x) for x in point] for point in points],
     }
 
