@@ -159,6 +159,23 @@ def test_gums_go_with_the_nearest_crowns() -> None:
     assert not jaws_at(places, mesh, {}).any()
 
 
+def test_scraps_of_crowns_at_the_border_are_no_jaw() -> None:
+    """Of the lower crowns a photograph of the upper ones shows some tips (closed models were made
+    of them)."""
+    mesh = sheet(
+        81, 81, lambda u, v: (2 * u - 1, 2 * v - 1, 0 * u), lambda u, v: (u, v, 0.5 + 0 * u)
+    )
+    seen = sights(mesh, [camera(0.0)], {"000": np.ones((SIZE, SIZE), bool)})
+
+    def found(lower: int) -> dict:
+        crowns = np.zeros((SIZE, SIZE), np.int8)
+        crowns[20 : SIZE - lower - 1], crowns[SIZE - lower :] = 1, -1
+        return jaws_of(mesh, seen, [crowns])
+
+    assert found(2) == {}
+    assert 500 < found(9)["lower"].sum() < 2000
+
+
 def test_the_underside_of_upper_crowns_is_the_upper_jaws() -> None:
     """Where they bite in front; as much of it was called the lower jaw's, and stood out from it."""
     mesh = sheet(

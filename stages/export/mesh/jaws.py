@@ -21,8 +21,9 @@ from stages.export.mesh.texture.sight import Sight
 Bools = npt.NDArray[np.bool_]
 Signs = npt.NDArray[np.int8]
 
-#: A jaw is known if its crowns are seen at this many vertices, and has this many faces.
-FEWEST_VERTICES, FEWEST_FACES = 30, 100
+#: A jaw is known if its crowns are seen at this many vertices; it has this many faces, and this
+#: share of the mesh's area: less is scraps of crowns at the border of photographs of the other jaw.
+FEWEST_VERTICES, FEWEST_FACES, LEAST_SHARE = 30, 100, 0.04
 #: Pixels by which crowns are taken smaller: their outlines are no better.
 BORDER = 1
 #: How often the border between the jaws is evened out.
@@ -80,7 +81,7 @@ def jaws_of(
         up: [3] unit, from the lower jaw to the upper one; None: not known.
 
     Returns:
-        Jaw -> [F] bool, both jaws; nothing, if the crowns of a jaw are hardly seen.
+        Jaw -> [F] bool, both jaws; nothing, if hardly anything of a jaw is seen.
     """
     votes = np.zeros(len(mesh.vertices), np.int64)
     for sight, crowns in zip(seen, maps, strict=True):
@@ -108,7 +109,9 @@ def jaws_of(
     touching[piece[pairs[border].ravel()]] = True
     small = sizes[piece] < SMALLEST_PIECE * np.where(upper, largest[True], largest[False])
     upper = upper ^ (small & touching[piece])
-    if min(upper.sum(), (~upper).sum()) < FEWEST_FACES:
+    area = np.linalg.norm(face_normals(mesh), axis=1)
+    share = area[upper].sum() / area.sum()
+    if min(upper.sum(), (~upper).sum()) < FEWEST_FACES or min(share, 1 - share) < LEAST_SHARE:
         return {}
     return {"upper": upper, "lower": ~upper}
 

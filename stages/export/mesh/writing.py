@@ -105,7 +105,10 @@ def write_models(
     if writer.scale.unit != "mm":
         return "no scale is known, so nobody can say how high a base is"
     if not jaws:
-        return "nothing says which part of the mesh belongs to which jaw"
+        return (
+            "hardly any crowns of one of the jaws are seen, so nothing tells which part of the "
+            "mesh belongs to which"
+        )
     mouth = writer.frame.to_mouth
     if mouth is None:
         return "too few teeth are known with their numbers to tell where the occlusal plane lies"
