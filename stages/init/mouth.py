@@ -36,8 +36,8 @@ Places = Mapping[tuple[str, int], Array]
 
 #: Crowns whose number is more doubtful than this say nothing.
 MOST_DOUBT = 0.5
-#: A crown's edge is looked for this share of the way from its tip to its zenith: at the tip itself
-#: the depth may already be that of what lies behind.
+#: The depth of a crown's edge is taken this share of the way from its tip to its zenith: at the tip
+#: itself it may already be that of what lies behind.
 INSIDE = 0.2
 #: So many teeth make a plane, and so many pairs the way to the left.
 LEAST_TEETH, LEAST_PAIRS = 5, 2
@@ -76,12 +76,12 @@ def tooth_places(
             for kind, near, far in (
                 ("tip", crown.tip, crown.zenith), ("zenith", crown.zenith, crown.tip)
             ):  # fmt: skip
-                pixel = ((1 - INSIDE) * near + INSIDE * far) * factor
-                if not ((pixel >= 0).all() and (pixel < (view.width, view.height)).all()):
+                inside = ((1 - INSIDE) * near + INSIDE * far) * factor
+                if not ((inside >= 0).all() and (inside < (view.width, view.height)).all()):
                     continue
-                z = depth_near(depth, pixel)
+                z = depth_near(depth, inside)
                 if z is not None:
-                    ray = (pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+                    ray = (near * factor - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
                     local = z * np.append(ray, 1.0) - camera.translation
                     key = (kind, permanent_of(crown.number))
                     found.setdefault(key, []).append(camera.rotation.T @ local)
