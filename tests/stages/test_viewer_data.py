@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stages.export.mesh.surface import Mesh
-from stages.export.viewer.compact import Pack, morton_order, octahedral
+from stages.export.viewer.compact import Pack, octahedral
 from stages.export.viewer.knowledge import (
     coarse,
     photographs_that_saw,
@@ -48,15 +48,6 @@ def test_columns_come_back(bits: int, delta: bool) -> None:
         levels = np.cumsum(steps, axis=1) % 2**bits
     back = np.array(told["low"]) + np.array(told["step"]) * levels.T
     assert np.abs(back - values).max() <= 0.51 * np.ptp(values, axis=0).max() / (2**bits - 1)
-
-
-def test_neighbours_stay_neighbours() -> None:
-    random = np.random.default_rng(0)
-    points = random.normal(size=(2000, 3))
-    order = morton_order(points)
-    assert sorted(order) == list(range(2000))
-    hop = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
-    assert np.median(hop) < 0.4 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
 
 
 def test_directions_survive_the_octahedron() -> None:

@@ -14,20 +14,17 @@ BITS = 10
 
 
 def morton_order(points: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
-    """[N] indices of finite points [N, 3] along a Morton curve through the box of the middle 98 %.
+    """[N] indices of finite points [N, 3] along a Z-shaped curve (Morton 1966) through cubes that
+    fill the box of the middle 98 %.
 
     Ties stay in their order.
     """
     if not len(points):
         return np.zeros(0, np.int64)
-    low, high = np.percentile(points, [1, 99], axis=0)
-    share = (points - low) / np.maximum(high - low, 1e-30)
-    cells = np.clip(share * (1 << BITS), 0, (1 << BITS) - 1).astype(np.uint64)
-    return order_of_cells(cells)
-
-
-def order_of_cells(cells: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
-    """[N] indices of cells [N, 3] of a grid of `BITS` bits an axis along a Morton curve."""
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    most = (1 << BITS) - 1
+    cells = np.clip((points - low) / np.maximum(high - low, 1e-30).max() * most, 0, most)
+    cells = cells.astype(np.uint64)
     code = np.zeros(len(cells), np.uint64)
     for bit in range(BITS):
         for axis in range(3):

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians
-from stages.export.splatfiles.order import order_of_cells
+from stages.export.splatfiles.order import morton_order
 from stages.export.splats import coefficients, opacities, smallest_three
 
 Floats = npt.NDArray[np.floating]
@@ -79,16 +79,6 @@ class Pack:
         squeeze = zlib.compressobj(6, zlib.DEFLATED, -15)
         data = squeeze.compress(b"".join(self._planes)) + squeeze.flush()
         return base64.b64encode(data).decode("ascii")
-
-
-def morton_order(points: Floats) -> npt.NDArray[np.int64]:
-    """[N] the points along a Z-shaped curve through space (Morton 1966), 10 bits an axis."""
-    if not len(points):
-        return np.zeros(0, np.int64)
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    cells = (points - low) / np.maximum(high - low, 1e-12).max() * 1023
-    cells = np.clip(cells, 0, 1023).astype(np.uint64)
-    return order_of_cells(cells)
 
 
 def packed_quaternions(quats_wxyz: Floats) -> npt.NDArray[np.uint32]:
