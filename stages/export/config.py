@@ -80,7 +80,9 @@ class ExportConfig(StageConfig):
     video: bool = Field(True, description="write orbit.mp4")
     video_seconds: float = Field(8.0, ge=0.5, le=120, description="length of one loop")
     video_fps: int = Field(25, ge=1, le=60, description="frames per second")
-    video_crf: int = Field(20, ge=0, le=51, description="x264 quality: smaller is better, larger")
+    video_crf: int = Field(
+        20, ge=1, le=51, description="x264 quality: smaller is better, and the file larger"
+    )
     video_sway: float = Field(2.0, ge=0, le=30, description="rise and fall on the way, in degrees")
     viewer: bool = Field(True, description="write viewer.html")
     viewer_photos: bool = Field(

@@ -171,12 +171,24 @@ def _finish_surface(
     elif config.mesh:
         skipped["mesh"] = "too little surface for a mesh"
         context.warn(
-            "No mesh was made: too little of the surface is known. More photographs that "
-            "overlap would help; the other exports are complete."
+            f"No mesh was made: too little of the surface is known{_more_surface(config)}. The "
+            "other exports are complete."
         )
     if config.preview:
         _write_preview(scene, mesh, folder)
     return len(mesh) if mesh is not None else None, page_bytes
+
+
+def _more_surface(config: ExportConfig) -> str:
+    """The end of a sentence: what would help where there is too little for a mesh."""
+    changed = [
+        f"export.{name}={value} (as a rule {usual})"
+        for name in ("mesh_confidence", "mesh_resolution", "mesh_cell", "mesh_depth")
+        if (value := getattr(config, name)) != (usual := ExportConfig.model_fields[name].default)
+    ]
+    if not changed:
+        return ". More photographs that overlap would help"
+    return f" with {' and '.join(changed)}. Leave that out, or take more photographs that overlap"
 
 
 def _write_mesh(

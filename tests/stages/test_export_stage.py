@@ -12,6 +12,7 @@ import numpy as np
 import open3d
 import pycolmap
 import pytest
+from pydantic import ValidationError
 
 from pipeline.artifacts.cameras import Cameras, read_colmap
 from pipeline.artifacts.gaussians import read_gaussians_ply
@@ -19,6 +20,7 @@ from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.views import View, Views, read_png, to_uint8
 from pipeline.errors import ReconstructionError
 from pipeline.stage import LocalContext
+from stages.export.pictures.video import Video
 from stages.export.stage import ExportConfig, ExportStage
 from stages.splatting.frame import move_cameras
 from tests.stages import export_scene as scene
@@ -293,6 +295,16 @@ def test_the_video_plays_and_shows_the_scene(folder: Path) -> None:
     assert np.abs(frames[2].astype(float) - frames[6]).mean() > 5, "the camera moves"
 
 
+def test_the_best_video_is_one_that_plays_everywhere(tmp_path: Path) -> None:
+    """Without loss it is "High 4:4:4 Predictive", which few decoders know."""
+    with pytest.raises(ValidationError):
+        ExportConfig(video_crf=0)
+    with Video(tmp_path / "best.mp4", (32, 32), 10, crf=1) as video:
+        video.add(np.random.default_rng(0).integers(0, 255, (48, 32), np.uint8))
+    with av.open(str(tmp_path / "best.mp4")) as found:
+        assert found.streams.video[0].codec_context.profile == "High"
+
+
 def test_the_preview_is_a_picture(folder: Path) -> None:
     picture = read_png(folder / "preview.png")
     assert picture.ndim == 3
@@ -324,6 +336,14 @@ def test_points_are_optional_and_views_may_differ_in_size(tmp_path: Path) -> Non
     description = json.loads((tmp_path / "exports" / "scene.json").read_text())
     assert description["frame"]["units"] == "arbitrary"
     assert description["frame"]["name"] == "upright"
+
+
+def test_settings_that_leave_no_mesh_are_named(tmp_path: Path) -> None:
+    alone = {"colmap": False, "splat_files": False, "video": False, "viewer": False}
+    context = export(tmp_path, mesh_confidence=100, preview=False, **alone)
+    (said,) = context.warnings
+    assert "known with export.mesh_confidence=100.0 (as a rule 1.2) and" in said
+    assert "export.mesh_resolution=64 (as a rule 256). Leave that out" in said
 
 
 def test_the_readme_speaks_of_what_is_there(tmp_path: Path) -> None:

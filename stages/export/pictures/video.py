@@ -31,7 +31,7 @@ class Video:
         path: of the `.mp4`.
         size: (width, height), both even.
         fps: frames a second.
-        crf: constant rate factor, 0 (lossless) to 51.
+        crf: constant rate factor, 1 to 51 (0, lossless, is of a profile that few play).
         beside: encode in a thread, while the caller makes the next frame.
     """
 
