@@ -269,3 +269,36 @@ def test_the_section_moves_on_all_keyboards(tmp_path: Path) -> None:
     assert found["windows"] == [5]
     assert found["zooms"] == 0, "what a layout has there goes first"
     assert found["browser"] == [0, 0, 0], "shortcuts of the browser stay"
+
+
+FIELDS = """(async () => {
+  await page.ready;
+  press("t");
+  const box = $("support"), slider = $("opacity");
+  const shown = (on) => { press("u", on); return page.state.numbers; };
+  box.click();
+  box.focus();
+  const result = { ticked: shown(box), slid: shown(slider) };
+  press("1", slider);
+  await page.ready;
+  result.view = $("label").textContent;
+  press("ArrowLeft", slider);
+  result.stays = $("label").textContent;
+  press("n");
+  press("Enter", canvas);
+  result.note = shown(document.querySelector("#marks input"));
+  press("]");
+  result.cut = [page.state.axis, page.state.at, $("told").textContent];
+  tell(result);
+})();"""
+
+
+@needs_chromium
+def test_keys_work_beside_boxes_and_sliders_and_not_in_text(tmp_path: Path) -> None:
+    """A box that was ticked, or the slider, keeps the focus: keys did nothing until a click."""
+    result, log = run_in(ball_page(), HEAD + FIELDS, tmp_path, (640, 480), coarse=True)
+    assert log == []
+    assert result == {
+        "ticked": "fdi", "slid": "universal", "view": "View 1", "stays": "View 1",
+        "note": "universal", "cut": ["off", 0, "Choose a section first (X)."],
+    }  # fmt: skip

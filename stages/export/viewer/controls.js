@@ -83,7 +83,10 @@ function addButtons(viewer) {
 function keysOf(viewer, tools) {
   const { store } = viewer;
   const toggle = (key) => () => tools.show({ [key]: !store.now[key] });
-  const cut = (step) => tools.show({ at: clamp(store.now.at + step, -1, 1) });
+  const cut = (step) => {
+    if (store.now.axis === "off") tools.tell("Choose a section first (X).");
+    else tools.show({ at: clamp(store.now.at + step, -1, 1) });
+  };
   return {
     ...steeringKeys(viewer),
     a: () => toggleTurn(viewer), b: () => viewer.nextBackground(), f: toggleFullScreen,
@@ -103,11 +106,12 @@ function keysOf(viewer, tools) {
 
 function addKeys(viewer, tools) {
   const keys = keysOf(viewer, tools);
-  const fields = "input, select, textarea, dialog";
+  const fields = 'input[type="text"], select, textarea, dialog';
   addEventListener("keydown", (event) => {
     const key = keyOf(event, keys);
     if (key === null) return;
-    const within = event.target.matches?.(fields);
+    const slides = event.target.type === "range" && key.startsWith("Arrow");
+    const within = slides || event.target.matches?.(fields);
     if (within && event.key !== "Escape") return;
     const onScene = event.target === viewer.canvas;
     if (onScene && (event.key === "Enter" || event.key === " ")) {
