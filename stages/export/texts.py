@@ -44,7 +44,7 @@ DESCRIPTIONS = {
     "model_upper.stl": "upper jaw, closed and with a base, for printing",
     "model_lower.stl": "lower jaw, closed and with a base, for printing",
     "points.ply": "thinned point cloud with colours",
-    "colmap": "COLMAP model: images, and cameras and points in sparse/0",
+    "colmap": "COLMAP model: images (and masks), cameras and points in sparse/0",
     "transforms.json": "the cameras for nerfstudio (ns-train splatfacto --data .)",
     "teeth.json": "the teeth: FDI and Universal number, doubt, place in 3D, outlines in the images",
     "teeth.csv": "the same as a table, a row for each tooth",
