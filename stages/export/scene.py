@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -62,26 +62,33 @@ class Scene:
         return to_uint8(self.painter(camera).image)
 
     def path(self, seconds: float, fps: int, sway_degrees: float) -> tuple[list[Camera], list[int]]:
-        """Places of the video, at the (even) size of the middle photograph, and each frame's.
-
-        What is cut out by masks is in the picture as a whole; other scenes go on beyond it.
-        """
+        """Places of the video, at the (even) size of the middle photograph, and each frame's."""
         middle = self.cameras[self.orbit.middle()]
         size = (even(middle.width), even(middle.height))
         count = max(1, round(seconds * fps))
         sway = np.radians(sway_degrees)
         places, frames = there_and_back(self.orbit, self.cameras, size, count, sway)
-        if self.masked:
-            some = thinned(centres(self.gaussians), _TO_FRAME, seed=0)
-            places = widened(places, some.positions.astype(np.float64))
-        return places, frames
+        return self._holding(places), frames
 
-    def novel_camera(self) -> Camera:
-        """A viewpoint between photographs, above or below: as far from all as one gets."""
+    def novel_camera(self, like: Camera) -> Camera:
+        """A viewpoint between photographs, above or below: as far from all as one gets.
+
+        Args:
+            like: whose lens and size it has.
+        """
         tried, _ = there_and_back(self.orbit, self.cameras, (2, 2), 60, np.radians(6.0))
         eyes = np.stack([camera.centre for camera in self.cameras])
         gaps = [np.linalg.norm(eyes - camera.centre, axis=1).min() for camera in tried]
-        return tried[int(np.argmax(gaps))]
+        farthest = tried[int(np.argmax(gaps))]
+        return self._holding([replace(like, cam_from_world=farthest.cam_from_world)])[0]
+
+    def _holding(self, cameras: list[Camera]) -> list[Camera]:
+        """The cameras, with what is cut out by masks in the picture as a whole; other scenes go on
+        beyond it."""
+        if not self.masked:
+            return cameras
+        some = thinned(centres(self.gaussians), _TO_FRAME, seed=0)
+        return widened(cameras, some.positions.astype(np.float64))
 
 
 def assemble(

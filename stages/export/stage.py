@@ -347,11 +347,11 @@ def _write_page(context: StageContext, scene: Scene, folder: Path, knowledge: Kn
 
 def _write_preview(scene: Scene, mesh: Mesh | None, folder: Path) -> None:
     from pipeline.artifacts.views import to_uint8
-    from stages.export.pictures.preview import beside, contact_sheet, panel_size, shade_mesh
+    from stages.export.pictures.preview import contact_sheet, panel_size, shade_mesh
 
     middle = scene.orbit.middle()
     camera = panel_size(scene.cameras[middle])
-    novel = beside(camera, scene.novel_camera())
+    novel = scene.novel_camera(camera)
     panels = [
         ("input photograph", scene.photos[scene.cameras[middle].name]),
         ("3D Gaussians, same viewpoint", to_uint8(scene.seen[middle].image)),

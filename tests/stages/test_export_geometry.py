@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.cameras import Camera, Cameras
+from pipeline.artifacts.space.frames import Frame
+from pipeline.artifacts.views import Views
 from stages.export.pictures.orbits import (
     between,
     central_depth,
@@ -15,6 +17,7 @@ from stages.export.pictures.orbits import (
     there_and_back,
     widened,
 )
+from stages.export.scene import assemble
 from stages.splatting.frame import (
     harmonics,
     harmonics_rotation,
@@ -160,6 +163,24 @@ def test_widened_cameras_hold_what_reached_beyond_the_picture() -> None:
 def test_cameras_that_hold_everything_stay_as_they_are() -> None:
     cameras = list(scene.ball_cameras())
     assert widened(cameras, np.zeros((4, 3)) + cameras[0].rotation[0] * 0.01) == cameras
+
+
+def test_the_preview_holds_the_mouth_as_a_whole() -> None:
+    """Seen from between close photographs, which do not hold it; what goes on behind is cut."""
+    case = scene.ball_case()
+    near = [replace(camera, fx=2 * camera.fx, fy=2 * camera.fy) for camera in scene.ball_cameras()]
+    mask = np.ones((scene.HEIGHT, scene.WIDTH), bool)
+    for masked in (False, True):
+        views = [replace(v, mask=mask if masked else None) for v in case["views"].views[:3]]
+        made = assemble(
+            Views(tuple(views)), Cameras(tuple(near)), case["gaussians"], None,
+            Frame("world", np.eye(4)), 1, lambda *_: None,
+        )  # fmt: skip
+        novel = made.novel_camera(near[1])
+        pixels, _ = novel.project(case["gaussians"].means)
+        inside = (pixels >= 0).all(1) & (pixels < (scene.WIDTH, scene.HEIGHT)).all(1)
+        assert (inside.mean() > 0.999) == masked
+        assert (novel.fx == near[1].fx) == (not masked)
 
 
 def test_a_path_through_many_shaky_cameras_is_smooth() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -128,8 +127,3 @@ def panel_size(camera: Camera, longest: int = 512) -> Camera:
     """The camera at the size of a panel."""
     scale = longest / max(camera.width, camera.height)
     return camera.resized(round(camera.width * scale), round(camera.height * scale))
-
-
-def beside(camera: Camera, other: Camera) -> Camera:
-    """`other`'s pose seen through `camera`'s lens."""
-    return replace(camera, cam_from_world=other.cam_from_world)
