@@ -14,11 +14,12 @@ from pipeline.artifacts.cameras import Cameras
 from pipeline.artifacts.dental.fdi import ALL_TEETH, is_primary, is_upper
 from pipeline.artifacts.space.frames import Frame
 from pipeline.artifacts.space.scale import NO_SCALE, Scale
-from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.models.known_cameras import KnownCamera, as_pinhole
 from pipeline.stage import LocalContext
 from stages.dentition.working import outline_in_view
+from stages.export.measuring.mouth import exported_dentition
 from stages.export.measuring.teeth_table import teeth_table, tooth_name
 from stages.export.scene import assemble
 from stages.export.stage import ExportConfig, ExportStage
@@ -221,8 +222,8 @@ def test_centres_count_by_the_pixels_that_show_the_crown() -> None:
     np.testing.assert_allclose(centre, [1, 0, 0])
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
+def undistorted(turned: bool) -> tuple[View, View]:
+    """A picture whose colours are its places, and the same with the distortion taken out."""
     width, height = (90, 120) if turned else (120, 90)
     v, u = np.mgrid[:height, :width] + 0.5
     image = np.stack([u / 128, v / 128, 0 * u], -1).astype(np.float32)
@@ -231,14 +232,39 @@ def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
     lens = pycolmap.Camera(
         model="OPENCV", width=240, height=180, params=[210, 205, 122, 88, -0.2, 0.05, 1e-3, 2e-3]
     )
-    straight, _ = as_pinhole(view, KnownCamera("000", lens, np.eye(4)))
+    return view, as_pinhole(view, KnownCamera("000", lens, np.eye(4)))[0]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_outlines_follow_an_image_that_was_undistorted(turned: bool) -> None:
+    view, straight = undistorted(turned)
     outline = np.array([[20.0, 25], [70, 22], [75, 70], [15, 60]])
-    moved = outline_in_view(outline, (width, height), straight)
+    moved = outline_in_view(outline, (view.width, view.height), straight)
     assert np.abs(moved - outline).max() > 1
     index = (moved - 0.5).astype(np.float32)
     shown = cv2.remap(straight.image, index[None, :, 0], index[None, :, 1], cv2.INTER_LINEAR)
     # the undistorted image has 8 bits: its coordinates are rounded to half pixels
     np.testing.assert_allclose(shown[0, :, :2] * 128, outline, atol=0.27)
+
+
+def test_crowns_of_a_tilted_photograph_keep_their_width_as_their_outlines_move() -> None:
+    """8 x 12 pixels, tilted by 40 degrees: 8 wide along the row, 14 from left to right."""
+    view, straight = undistorted(False)
+    turn = np.radians(40)
+    right, down = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    corners = [a * 4 * right + b * 6 * down for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    outline = np.array([60.0, 45]) + corners
+    zenith, tip = (np.array([60.0, 45]) + b * 6 * down for b in (-1, 1))
+    crown = Crown("upper", zenith, tip, None, None, tip, None, 8, 12, outline=outline, number=11)
+    size = (view.width, view.height)
+    read = Dentition("000", size, "front", (crown,))
+    assert exported_dentition(read, view) is read
+    (moved,) = exported_dentition(read, straight).upper
+    for name in ("outline", "tip", "zenith"):
+        expected = outline_in_view(np.atleast_2d(getattr(crown, name)), size, straight)
+        np.testing.assert_allclose(np.atleast_2d(getattr(moved, name)), expected)
+    assert moved.width == pytest.approx(8, rel=0.1)
+    assert moved.height == pytest.approx(12, rel=0.1)
 
 
 def test_outlines_follow_an_image_of_another_size() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -357,33 +357,3 @@ def _joined(seen: Sequence[Sighting]) -> Landmark:
         chi = sum(float(o @ inverse @ o) for o, inverse in zip(off, terms, strict=True))
         joint = joint * max(1.0, chi / (3 * len(seen) - 3))
     return Landmark(point, joint, min(sighting.doubt for sighting in seen))
-
-
-def moved_dentition(dentition: Dentition, outlines: Mapping[int, Array]) -> Dentition:
-    """A dentition whose crowns' points are given anew.
-
-    Args:
-        dentition: as the teeth were read.
-        outlines: position in `all_crowns` -> [K + 4, 2] what `landmark_pixels` gives, as exported.
-    """
-    crowns = []
-    for index, crown in enumerate(dentition.all_crowns):
-        points = outlines[index]
-        outline, (zenith, tip, left, right) = points[:-4], points[-4:]
-        crowns.append(
-            replace(
-                crown, outline=outline, zenith=zenith, tip=tip,
-                embrasure_left=None if crown.embrasure_left is None else left,
-                embrasure_right=None if crown.embrasure_right is None else right,
-                width=float(np.ptp(outline[:, 0])) if len(outline) else crown.width,
-            )
-        )  # fmt: skip
-    split = len(dentition.upper)
-    return replace(dentition, upper=tuple(crowns[:split]), lower=tuple(crowns[split:]))
-
-
-def landmark_pixels(crown: Crown) -> Array:
-    """[K + 4, 2] outline, zenith, tip and embrasures: what `moved_dentition` puts back."""
-    points = [crown.zenith, crown.tip]
-    points += [crown.tip if p is None else p for p in (crown.embrasure_left, crown.embrasure_right)]
-    return np.concatenate([crown.outline.reshape(-1, 2), np.array(points)])

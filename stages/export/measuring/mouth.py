@@ -11,14 +11,10 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.space.scale import Scale
-from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from stages.dentition.working import outline_in_view
-from stages.export.measuring.landmarks import (
-    landmark_pixels,
-    moved_dentition,
-    read_landmarks,
-)
+from stages.export.measuring.landmarks import read_landmarks
 from stages.export.measuring.measures import measure_mouth, mouth_axes
 from stages.export.teeth import LEAST_ALPHA
 from stages.splatting.rendering import RenderedView
@@ -77,14 +73,24 @@ def read_mouth(
 
 
 def exported_dentition(dentition: Dentition, view: View) -> Dentition:
-    """A dentition in pixels of the image that is exported (see `outline_in_view`)."""
-    crowns = dentition.all_crowns
+    """A dentition in pixels of the image that is exported (see `outline_in_view`), without papillae
+    and embrasures."""
     size = (view.width, view.height)
     if dentition.size == size and not view.lens_taken_out:
         return dentition
-    pixels = [landmark_pixels(crown) for crown in crowns]
-    if pixels:
-        moved = outline_in_view(np.concatenate(pixels), dentition.size, view)
-        split = np.cumsum([len(points) for points in pixels])[:-1]
-        dentition = moved_dentition(dentition, dict(enumerate(np.split(moved, split))))
-    return replace(dentition, size=size)
+
+    def moved(crown: Crown) -> Crown:
+        points = np.concatenate([[crown.zenith, crown.tip], crown.outline.reshape(-1, 2)])
+        (zenith, tip), outline = np.split(outline_in_view(points, dentition.size, view), [2])
+        wider = 1.0
+        if len(outline):
+            before, after = (np.hypot(*np.ptp(o, axis=0)) for o in (crown.outline, outline))
+            wider = float(after) / max(float(before), 1e-9)
+        return replace(
+            crown, zenith=zenith, tip=tip, outline=outline,
+            width=wider * crown.width, height=wider * crown.height,
+            papilla_left=None, papilla_right=None, embrasure_left=None, embrasure_right=None,
+        )  # fmt: skip
+
+    upper, lower = (tuple(map(moved, row)) for row in (dentition.upper, dentition.lower))
+    return replace(dentition, size=size, upper=upper, lower=lower)
