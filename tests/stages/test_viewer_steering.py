@@ -120,12 +120,13 @@ def test_small_windows_have_room_for_everything(tmp_path: Path, size: tuple[int,
 
 
 PAPER = """(async () => {
+  const frames = [];
+  requestAnimationFrame = (frame) => frames.push(frame);  // on a busy machine none may come
   await page.ready;
   press("u");
   press("t");
   press("p");
-  await new Promise((done) => setTimeout(done, 300));
-  requestAnimationFrame = () => 0;  // nothing is drawn anew on its way to the printer
+  frames.forEach((frame) => frame(performance.now()));  // no more on its way to the printer
   const box = (element) => element.getBoundingClientRect();
   const places = () => [...document.querySelectorAll("#drawing .number, #photo")].map((element) => {
     const [{ x, y, width, height }, whole] = [box(element), box(canvas)];
