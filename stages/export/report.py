@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from math import floor, log10
 from typing import TYPE_CHECKING, Any
 
 from pipeline.pages.parts import Hero, Link, Section, Text
@@ -71,9 +72,11 @@ def _measured(entry: Mapping[str, Any]) -> list[Cell]:
     if entry["value"] is None:
         return [title, Cell("not visible"), Cell(str(entry["not_visible"]))]
     value, off = entry["value"], entry["uncertainty"]
-    unit, digits = (" mm", 1) if entry["unit"] == "mm" else (" (no scale)", 3)
+    unit, digits = " mm", 1
+    if entry["unit"] != "mm":  # of any size, as the viewer has them (`lengthText`)
+        unit, digits = " (no scale)", min(max(1 - floor(log10(max(off, 1e-6))), 0), 6)
     signed = entry["name"] in ("overjet", "overbite")
-    shown = value if signed else abs(value)
+    shown = round(value if signed else abs(value), digits) + 0.0
     said = [entry["direction"], entry["sure"]]
     if entry["estimated"]:
         said = ["estimated", *said]

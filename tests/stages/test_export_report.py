@@ -36,7 +36,9 @@ def test_measurements_stand_on_the_page_with_how_sure_they_are(tmp_path: Path) -
             entry("midline_shift", -1.26, direction="to the right"),
             entry("overbite", 3.0, estimated={"covered_percent": 40.0}),
             entry("width", None, not_visible="no photograph shows 16"),
+            entry("overjet", -0.04),
             entry("length", 0.1234, unit="none"),
+            entry("length", 0.001234, unit="none", uncertainty=0.000321),
         ],
     }
     (tmp_path / "teeth.json").write_text(json.dumps(found))
@@ -48,7 +50,9 @@ def test_measurements_stand_on_the_page_with_how_sure_they_are(tmp_path: Path) -
         ["Midline_shift", "1.3 ± 0.9 mm", "to the right; fair"],
         ["Overbite", "3.0 ± 0.9 mm", "estimated; fair"],
         ["Width", "not visible", "no photograph shows 16"],
-        ["Length", "0.123 ± 0.940 (no scale)", "fair"],
+        ["Overjet", "0.0 ± 0.9 mm", "fair"],
+        ["Length", "0.12 ± 0.94 (no scale)", "fair"],
+        ["Length", "0.00123 ± 0.00032 (no scale)", "fair"],
     ]
     assert all(isinstance(text, Text) for text in texts)
     assert texts[-1].text == "Lengths are in millimetres."

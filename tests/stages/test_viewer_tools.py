@@ -141,6 +141,7 @@ def test_measuring_and_overlays(tmp_path: Path) -> None:
     assert found["tool"] == "turn"
     assert [text.split()[0] for text in found["marks"]] == ["Distance", "Angle"]
     assert found["table"][0] == "Overjet-2.5 ± 0.4 mmsure"
+    assert found["table"][-1] == "Edge to edge0.0 ± 0.4 mmsure", "no minus before nothing"
     assert found["behind"] == "Overjet -2.5 ± 0.4 mm", "lower teeth in front"
     assert found["table"][1] == "Overbitenot visible: the upper teeth cover the edges"
     assert found["table"][2] == (

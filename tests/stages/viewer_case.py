@@ -67,6 +67,7 @@ def ball_page() -> str:
                         points=None, not_visible="the upper teeth cover the edges"),
             measurement(name="overbite", title="Overbite", value=3.1, uncertainty=2.2,
                         sure="unsure", estimated=ESTIMATED),
+            measurement(title="Edge to edge", value=-0.02),
         ],
         axes=AXES, jaws=jaws, seen=photographs_that_saw(ball.means, surfaces),
         mesh=(corners, triangles, np.array([1, 1, 2, 2], np.uint8)),

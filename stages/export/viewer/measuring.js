@@ -36,13 +36,16 @@ function angleOf([a, b, c]) {
   };
 }
 
+/** A number with so many decimals, and no minus before zeros. */
+const decimals = (value, digits) => (Number(value.toFixed(digits)) || 0).toFixed(digits);
+
 /** A length for people: with its unit and uncertainty, or said to have none. */
 function lengthText(value, off, scale) {
   if (scale.unit !== "mm") {
-    const digits = clamp(2 - Math.floor(Math.log10(Math.max(off, 1e-6)) + 1), 0, 6);
-    return `${value.toFixed(digits)} ± ${off.toFixed(digits)} (no scale)`;
+    const digits = clamp(1 - Math.floor(Math.log10(Math.max(off, 1e-6))), 0, 6);
+    return `${decimals(value, digits)} ± ${off.toFixed(digits)} (no scale)`;
   }
-  return `${value.toFixed(1)} ± ${Math.max(off, 0.1).toFixed(1)} mm`;
+  return `${decimals(value, 1)} ± ${Math.max(off, 0.1).toFixed(1)} mm`;
 }
 
 /** What was measured by itself, for people: overjet and overbite have a sign, the others a side. */
