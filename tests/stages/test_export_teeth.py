@@ -128,7 +128,8 @@ def test_a_row_for_each_tooth(folder: Path, written: dict) -> None:
 
 def test_what_is_not_known_is_an_empty_cell() -> None:
     tooth = {"fdi": 85, "universal": "T", "jaw": "lower", "dentition": "primary", "doubt": 0.5}
-    tooth |= {"centre": None, "spread": None, "width": None, "height": None, "seen_in": [{}]}
+    twice = [{"photograph": "002"}] * 2  # two crowns that carry the number
+    tooth |= {"centre": None, "spread": None, "width": None, "height": None, "seen_in": twice}
     text = teeth_table({"units": "arbitrary", "teeth": [tooth]})
     assert text.splitlines()[1] == (
         "85,T,lower right primary second molar,lower,right,primary,0.5,,,,,,,arbitrary,1"

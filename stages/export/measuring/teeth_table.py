@@ -50,7 +50,7 @@ def teeth_table(described: Mapping[str, Any]) -> str:
                 fdi, tooth["universal"], tooth_name(fdi), tooth["jaw"],
                 "left" if is_left(fdi) else "right", tooth["dentition"], tooth["doubt"], *centre,
                 tooth["spread"], tooth["width"], tooth["height"], described["units"],
-                len(tooth["seen_in"]),
+                len({seen["photograph"] for seen in tooth["seen_in"]}),
             )
         )  # fmt: skip
     return text.getvalue()
