@@ -25,6 +25,8 @@ from stages.splatting.rasterizer import LOW_PASS, Rendering, Viewpoint, rasteriz
 Backend = Literal["auto", "cpu", "gsplat", "reference"]
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
+#: logarithms of scales and of odds are held there: what is beyond is 0 or 1 in float32
+FARTHEST = 80.0
 
 
 def choose_backend() -> Literal["cpu", "gsplat"]:
@@ -167,9 +169,10 @@ class _Kernels(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         arrays = [_array(value) for value in (means, quats, scales, opacities, colors)]
         centre, quat, scale, opacity, colour = arrays
-        # a scale of 0 and an opacity of 1 are infinite here, and come back as what they are
+        # a scale of 0 and an opacity of 1 are infinite here, which the kernels don't draw
         with np.errstate(divide="ignore", invalid="ignore"):
-            columns = [centre, quat, np.log(scale), np.log(opacity / (1 - opacity))[:, None]]
+            logs = np.log(scale), np.log(opacity / (1 - opacity))[:, None]
+        columns = [centre, quat, *(np.clip(log, -FARTHEST, FARTHEST) for log in logs)]
         if request.with_colour and request.degree is not None:
             columns.append(colour.reshape(len(colour), 3 * colour.shape[1]))
         pose, k = _array(viewmat), _array(K)

@@ -103,18 +103,32 @@ def test_pose_gradient_has_the_effect_of_the_twist_and_none_other() -> None:
     assert np.allclose(shear, -shear.T)
 
 
-def test_colors_per_camera_and_an_opaque_gaussian() -> None:
+def test_colors_per_camera() -> None:
     leaves = inputs(torch.float32, sh=False)
     single = rasterization(**leaves, width=WIDTH, height=HEIGHT, backend="cpu")[0]
     both = leaves["colors"].detach()
     leaves["colors"] = torch.stack([both, 2 * both]).requires_grad_(True)
     leaves["backgrounds"] = torch.zeros(2, 5)
-    with torch.no_grad():
-        leaves["opacities"][5], leaves["scales"][6] = 1.0, 0.0
     images, *_ = rasterization(**leaves, width=WIDTH, height=HEIGHT, backend="cpu")
     assert images.shape == single.shape
     images.sum().backward()
     assert leaves["colors"].grad.shape == (2, 40, 5)
+
+
+def test_what_is_opaque_or_flat_is_drawn() -> None:
+    """As inputs of a torch optimiser may be: opacities of exactly 1, scales of exactly 0."""
+    leaves = inputs(torch.float32, sh=False)
+    with torch.no_grad():
+        leaves["opacities"][::2], leaves["scales"][1::3, 2] = 1.0, 0.0
+    size = {"width": WIDTH, "height": HEIGHT, "near_plane": 0.2}
+    images, alphas, meta = rasterization(**leaves, **size, backend="cpu")
+    exact = {name: value.detach().double() for name, value in leaves.items()}
+    truth, opaque, _ = rasterization(**exact, **size, backend="reference")
+    sure = sure_pixels(exact, {})[..., None]
+    assert ((images.double() - truth).abs() * sure).max() < 1e-4 * float(truth.abs().max())
+    assert ((alphas.double() - opaque).abs() * sure).max() < 1e-4
+    assert (meta["radii"] > 0).all(-1)[:, 2::2].any()
+    (images.sum() + alphas.sum()).backward()
     for name in ("opacities", "scales", "means"):
         assert torch.isfinite(leaves[name].grad).all(), name
 
