@@ -44,7 +44,7 @@ class Trainer:
         rasterize: what steps are taken with (see `backend`).
         views: those that take part; queue: those whose turn it still is.
         iteration: steps taken, of `iterations`, which `Extension` may raise.
-        haste: factor of the rates of positions and colours (lit: of normals too), from `Extension`.
+        haste: factor of the rates of positions and harmonics, from `Extension`.
         psnr, loss: running means over recent iterations.
     """
 

@@ -181,6 +181,23 @@ def test_views_of_other_sizes_masks_unplaced_views_and_flow(tmp_path) -> None:
     assert [c.name for c in here.result("cameras").cameras] == ["000", "001", "002"]
 
 
+def test_flow_to_several_views_counts_all_of_it(tmp_path) -> None:
+    """As flow.window makes it: what leads from a view to its second neighbour has a say too."""
+    views, cameras, points = case()
+    still, good = np.zeros((HEIGHT, WIDTH, 2), np.float32), np.ones((HEIGHT, WIDTH), bool)
+    pairs = [FlowPair("000", name, still, still, good, good) for name in ("001", "002")]
+    made = []
+    for number in (1, 2):
+        here = context(
+            tmp_path / str(number), views, cameras, points, Flow(tuple(pairs[:number])),
+            iterations=24, light="none", lambda_flow=0.1,
+        )  # fmt: skip
+        FitStage().run(here)
+        assert here.figures["flow_pairs"] == number
+        made.append(here.result("gaussians").means)
+    assert not np.array_equal(*made)
+
+
 def test_too_little_to_start_from_is_explained(tmp_path) -> None:
     views, cameras, points = case()
     with pytest.raises(ReconstructionError, match="Only 1 of 3 photographs"):

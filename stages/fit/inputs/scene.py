@@ -25,7 +25,7 @@ from stages.fit.inputs.targets import Target, make_pyramids, point_depth
 from stages.fit.parts.start import coarse_factors
 from stages.fit.trainer import Trainer
 
-Flows = dict[int, tuple[int, Floats, Bools]]
+Flows = dict[int, list[tuple[int, Floats, Bools]]]
 
 #: scene extent: this times the largest distance of a camera from their middle (3DGS), at least
 #: MIN_EXTENT of the scene's depth (cameras that hardly move must not freeze the positions)
@@ -129,7 +129,7 @@ def prepare(
             cloud.positions, cloud.positions[trusted], local, settings.fill_tolerance
         )
         cloud, trusted = cloud.select(keep), trusted[keep]
-    flows = chosen_flows(views, flow) if settings.lambda_flow > 0 else {}
+    flows = flows_between(views, flow) if settings.lambda_flow > 0 else {}
     factors = {1, *coarse_factors(settings)}
     if settings.light == "auto":
         factors.add(settings.light_trial_factor)
@@ -177,13 +177,12 @@ def in_frame(camera: Camera, frame: Frame) -> Camera:
     return replace(camera, cam_from_world=matrix)
 
 
-def chosen_flows(views: Sequence[View], flow: Flow | None) -> Flows:
-    """For each placed view its flow to another placed one: (index of that, flow, mask)."""
+def flows_between(views: Sequence[View], flow: Flow | None) -> Flows:
+    """For each placed view its flow to other placed ones: (index of that, flow, mask)."""
     index = {view.name: position for position, view in enumerate(views)}
-    chosen: Flows = {}
+    found: Flows = {}
     for pair in flow.pairs if flow is not None else ():
         i, j = index.get(pair.name_i), index.get(pair.name_j)
-        if i is None or j is None or i in chosen or not pair.mask_forward.any():
-            continue
-        chosen[i] = (j, pair.forward, pair.mask_forward)
-    return chosen
+        if i is not None and j is not None and pair.mask_forward.any():
+            found.setdefault(i, []).append((j, pair.forward, pair.mask_forward))
+    return found

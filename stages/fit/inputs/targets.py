@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ class Target:
         intrinsics: [4] float32 fx, fy, cx, cy at this size.
         colour: the colour loss against its image.
         depth: [H, W] float32 depth of the points seen there, 0 where there is none.
-        flow: to the next view, or None.
+        flows: to the next views.
     """
 
     width: int
@@ -43,7 +43,7 @@ class Target:
     intrinsics: Floats
     colour: ColourLoss
     depth: Floats
-    flow: FlowTarget | None = None
+    flows: list[FlowTarget] = field(default_factory=list)
 
 
 def point_depth(
@@ -121,15 +121,14 @@ def make_pyramids(
     cameras: Sequence[Camera],
     factors: Sequence[int],
     positions: Array | None,
-    flows: Mapping[int, tuple[int, Floats, Bools]],
+    flows: Mapping[int, Sequence[tuple[int, Floats, Bools]]],
 ) -> list[dict[int, Target]]:
-    """For each view, factor -> target; `flows` maps a view to (next view, flow, mask)."""
+    """For each view, factor -> target; `flows` maps a view to (next view, flow, mask) of each."""
     pyramids = []
     for view, (image, mask, camera) in enumerate(zip(images, masks, cameras, strict=True)):
         levels = {f: make_target(image, mask, camera, f, positions) for f in sorted(set(factors))}
-        if view in flows:
-            to, flow, trusted = flows[view]
+        for to, flow, trusted in flows.get(view, ()):
             for target in levels.values():
-                target.flow = make_flow_target(flow, trusted, to, target)
+                target.flows.append(make_flow_target(flow, trusted, to, target))
         pyramids.append(levels)
     return pyramids

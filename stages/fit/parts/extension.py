@@ -38,7 +38,7 @@ class Extension(Part, switch="extension", off=0.0, kept=("share",)):
             f"{MORE} where fit.iterations is automatic and no surface is held, else 0"
         )
         """by which share of the iterations a fit is longer that is far from right by then; its
-        rates of positions and colours are up to twice as high"""
+        rates of positions and harmonics are up to twice as high"""
         # eleven photographs of a castle have 18.6 dB by then, three of a street 21.8; 12 of a mouth
         # with much noise (.1) 23.6, with exposures of their own (15 %) 25.6, else 25.8 and more
         extension_psnr: Pair = (20.5, 23.5)

@@ -54,11 +54,13 @@ class Flow(Part, switch="lambda_flow", off=0.0):
 
     def __init__(self, fit: Trainer) -> None:
         super().__init__(fit)
-        self.pairs = sum(target[1].flow is not None for target in fit.targets)
+        self.pairs = sum(len(target[1].flows) for target in fit.targets)
 
     def ask(self, fit: Trainer, step: Step) -> None:
-        step.flow = step.target.flow if fit.iteration % 2 == 1 else None
-        if step.flow is not None:
+        flows = step.target.flows
+        if flows and fit.iteration % 2 == 1:
+            # to which of several views is drawn by lot
+            step.flow = flows[int(fit.random.integers(len(flows))) if len(flows) > 1 else 0]
             there = fit.targets[step.flow.to][step.factor]
             step.following = fit.viewpoint(step.flow.to, there)
 
