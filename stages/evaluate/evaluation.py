@@ -39,6 +39,8 @@ from stages.splatting.support import SeenSurface
 #: are of final renders at 8 bits; the PSNR that the fit reports on its way is a running mean over
 #: single views before rounding, through the fit's own loss, and only tells how far it has come.
 PROTOCOL = "input views (training views), 8-bit images, registered cameras"
+#: Held-out photographs of which by so much more counts than of the input ones are worth a word.
+UNLIKE = 0.1
 #: The two ways of placing held-out photographs, which no table may mix.
 TEST_PROTOCOLS = {
     "registered": "held-out photographs, 8-bit images; cameras registered only: the true ones, "
@@ -108,6 +110,7 @@ def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Re
                 figures["held_out"] = _held_out(
                     context, examiner, held, truth, registration, depth, surfaces
                 )
+                _warn_of_masks(context, figures)
     elif held:
         context.warn(
             f"{len(held)} photographs are held out, but their cameras are not known: they are not "
@@ -264,6 +267,25 @@ def _held_out(
     }
     sources = {view.name: view.source_name for view in scored}
     return {**blocks, "pictures": asked[-1], "sources": sources}
+
+
+def _warn_of_masks(context: StageContext, figures: dict[str, Any]) -> None:
+    """Say where held-out photographs count in parts that the scene was never made from."""
+    held = figures["held_out"]
+    scored = next((held[name] for name in TEST_PROTOCOLS if name in held), None)
+    if scored is None:
+        return
+    used, counted = (
+        float(np.mean([view["pixels"] for view in block["views"].values()]))
+        for block in (figures, scored)
+    )
+    if counted - used > UNLIKE:
+        context.warn(
+            f"The scene is made from {used:.0%} of the input photographs' pixels (the rest is "
+            f"masked), but of held-out ones {counted:.0%} count: what it was never to show counts "
+            "as wrong. Figures of a part of them are had by evaluate.masks; whole photographs of "
+            "teeth are used with init.dental.mask_rest=false."
+        )
 
 
 def _poses(

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 #: Below this a card is coloured: the scene explains its own photographs badly.
 POOR_PSNR = 22.0
+#: Views of which more than this counts, as a share, are not masked to speak of; scenes that cover
+#: more than this of held-out views leave no gap to speak of.
+WHOLE, MOSTLY = 0.995, 0.8
 #: Comparisons on the page at most; with more than the second each is drawn smaller.
 MOST_COMPARISONS, MANY_COMPARISONS, MEDIUM = 24, 12, 440
 #: Comparisons that stand among the pictures to check.
@@ -52,11 +55,12 @@ def cards(case: Case) -> Iterator[Card]:
 def findings(case: Case) -> Iterator[Fact]:
     """Plain sentences: how good the scene is, and what that was measured on."""
     metrics = metrics_of(case)
-    mean, worst = metrics.input.mean, metrics.input.worst
+    mean, worst, counted = metrics.input.mean, metrics.input.worst, _counted(metrics.input)
     if mean.get("psnr") is not None:
+        part = "them" if counted > WHOLE else f"the {100 * counted:.0f} % of them that masks leave"
         text = (
-            "Rendered from where the photographs were taken, the scene repeats them with a PSNR of "
-            f"{mean['psnr']:.2f} dB"
+            f"Rendered from where the photographs were taken, the scene repeats {part} with a PSNR "
+            f"of {mean['psnr']:.2f} dB"
         )
         if worst.get("psnr"):
             view = worst["psnr"]["view"]
@@ -65,9 +69,10 @@ def findings(case: Case) -> Iterator[Fact]:
     yield from _about_unseen(metrics)
     coverage = metrics.figures.get("coverage")
     if coverage is not None:
+        used = "" if counted > WHOLE else " that masks leave"
         yield Fact(
-            f"The scene covers {100 * coverage:.1f} % of the photographs' pixels; the rest stays "
-            "empty."
+            f"The scene covers {100 * coverage:.1f} % of the photographs' pixels{used}; the rest "
+            "stays empty."
         )
     if metrics.figures and not metrics.held_out:
         kept_back = case.latest("held_out")
@@ -93,7 +98,7 @@ def _about_unseen(metrics: Metrics) -> Iterator[Fact]:
         )
         yield Fact(
             f"{count} {held_out} held out, that is, never shown to the reconstruction. It predicts "
-            f"{'it' if count == 1 else 'them'} with a PSNR of {told}."
+            f"{'it' if count == 1 else 'them'} with a PSNR of {told}{_shown(blocks)}."
         )
     unsupported = [scores.mean.get("unsupported") for scores in blocks.values()]
     if unsupported and unsupported[0] is not None:
@@ -109,6 +114,20 @@ def _about_unseen(metrics: Metrics) -> Iterator[Fact]:
             f"Looked at from {novel['degrees_beyond']:.0f} degrees beyond the outermost "
             f"photographs, {told} of what the scene shows was never photographed."
         )
+
+
+def _counted(scores: Scores) -> float:
+    """Share of the pixels of some views that counts, 0..1; 1 where nobody says."""
+    shares = [figures.get("pixels", 1.0) for figures in scores.views.values()]
+    return sum(shares) / len(shares) if shares else 1.0
+
+
+def _shown(blocks: Mapping[str, Scores]) -> str:
+    """How little of held-out photographs the scene shows, where it is little."""
+    coverage = next(iter(blocks.values())).mean.get("coverage")
+    if coverage is None or coverage > MOSTLY:
+        return ""
+    return f"; the scene covers {100 * coverage:.0f} % of their pixels, and the rest counts as well"
 
 
 def renders(case: Case) -> Iterator[Section]:

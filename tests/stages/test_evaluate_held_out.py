@@ -112,6 +112,34 @@ def test_everything_where_the_reconstruction_is_exact(tmp_path: Path) -> None:
     assert novel["first"]["unsupported"] >= held["registered"]["mean"]["unsupported"]
 
 
+def test_whole_photographs_held_out_beside_masked_ones_are_said(tmp_path: Path) -> None:
+    """As after `init.dental.mask_rest`: 9 dB on lips that the scene was never to show."""
+    inputs = case(tmp_path)
+    mask = np.zeros((72, 96), bool)
+    mask[18:54] = True
+    shown = tuple(replace(view, mask=mask) for view in inputs["views"].views)
+    masked = inputs | {"views": Views(shown)}
+    truth: dict[str, Any] = {"ground_truth": str(tmp_path / "transforms.json"), "flip": False}
+    context = run(tmp_path / "out", masked, test_poses="registered", novel_angle=0, **truth)
+    (said,) = context.warnings
+    assert "from 50% of the input" in said and "of held-out ones 100% count" in said
+    metrics = context.result("metrics")
+    facts = [
+        fact.text
+        for fact in PARTS["findings"](SimpleNamespace(latest={"metrics": metrics}.get, labels={}))
+    ]
+    assert any("repeats the 50 % of them that masks leave" in text for text in facts)
+    assert any("pixels that masks leave" in text for text in facts)
+    assert not any("counts as well" in text for text in facts)
+    metrics.figures["held_out"]["registered"]["mean"]["coverage"] = 0.35
+    again = PARTS["findings"](SimpleNamespace(latest={"metrics": metrics}.get, labels={}))
+    assert any("covers 35 % of their pixels" in fact.text for fact in again)
+    both = masked | {
+        "held_out": HeldOut(tuple(replace(v, mask=mask) for v in inputs["held_out"].views))
+    }
+    assert not run(tmp_path / "b", both, test_poses="registered", novel_angle=0, **truth).warnings
+
+
 def test_masks_that_mark_nothing_are_said(tmp_path: Path) -> None:
     inputs = case(tmp_path)
     masks = tmp_path / "masks"
