@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.artifacts.cameras import Camera
+from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.pointmaps import PointmapPair, Pointmaps
 from pipeline.artifacts.views import View, Views
 from pipeline.geometry.depths import view_depths
@@ -137,6 +137,37 @@ def test_photographs_of_other_shapes_have_a_lens_of_their_own():
         refined = {c.name: _read(model, k, c) for k, c in enumerate(cameras, start=1)}
         assert turned(refined, cameras) < 1e-3
         assert all(abs(camera.fx - 700) < 0.1 for camera in refined.values())
+
+
+def test_matches_that_are_asked_for_are_used_for_given_cameras_too(world, tmp_path):
+    """Whatever `refine` is; and where they change nothing, it is said, and nothing changes."""
+    views = Views(tuple(View(c.name, i) for c, i in zip(world[0], world[1], strict=True)))
+    for bent in (0.03, 0.0):
+        given = Cameras(tuple(aligned(world, bent)[0].values()))
+        inputs = {"views": views, "pointmaps": Pointmaps(pointmaps(world, bent)), "cameras": given}
+        config = AlignConfig(matches="always", match_min=40)
+        context = LocalContext(config, tmp_path / str(bent), inputs, threads=2)
+        AlignStage().run(context)
+        found, before = context.result("cameras").by_name(), given.by_name()
+        if bent:
+            assert not context.warnings
+            assert turned(found, world[0]) < 0.5 * turned(before, world[0])
+        else:
+            (said,) = context.warnings
+            assert "change no camera: they agree with the pointmaps" in said
+            for name, camera in before.items():
+                off = found[name].cam_from_world - camera.cam_from_world
+                assert np.abs(off).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [({"match_points": 40}, "less than match_min"),
+     ({"matches": "always", "hold_poses": True}, "hold_poses holds them")],
+)  # fmt: skip
+def test_matches_that_could_change_nothing_are_refused(settings, said):
+    with pytest.raises(ValueError, match=said):
+        AlignConfig(**settings)
 
 
 def test_the_stage_uses_matches_where_cameras_come_from_pointmaps_alone(world, tmp_path):
