@@ -178,8 +178,7 @@ def _run(context: StageContext) -> None:
         config.depth_tolerance, config.min_texture, config.highlight_level,
     )  # fmt: skip
     results: list[FlowPair] = []
-    deviations = []
-    shares = []
+    deviations, shares, poor = [], [], []
     context.progress("flow", 0, len(pairs))
     found = in_threads(
         lambda pair: flow_between(sides[pair[0].name], sides[pair[1].name], estimator, trust),
@@ -188,10 +187,7 @@ def _run(context: StageContext) -> None:
     for (view_i, view_j, angle), (forward, backward) in zip(pairs, found, strict=True):
         share = 0.5 * float(forward.mask.mean() + backward.mask.mean())
         if share < _POOR_SHARE and not angle > _NEAR:
-            context.warn(
-                f"The flow between views {view_i.name} and {view_j.name} can be trusted on only "
-                f"{share:.0%} of the pixels; this pair hardly contributes to the fit."
-            )
+            poor.append(f"{view_i.name} and {view_j.name} ({share:.0%})")
         shares.append(share)
         deviations += [forward.deviation, backward.deviation]
         results.append(
@@ -200,6 +196,11 @@ def _run(context: StageContext) -> None:
                 forward.flow, backward.flow, forward.mask, backward.mask,
             )
         )  # fmt: skip
+    if poor:
+        context.warn(
+            "Flow can be trusted on few pixels, and hardly contributes to the fit, between views "
+            f"{', '.join(poor)}."
+        )
     context.save(Flow(tuple(sorted(results, key=lambda pair: (pair.name_i, pair.name_j)))))
 
     figures: dict[str, float | int | str] = {

@@ -104,8 +104,9 @@ class SapStage(Stage):
             cloud = prune(cloud)
         if len(cloud) == 0:
             raise ReconstructionError(
-                f"Pruning with mode '{config.mode}' left none of {before} points. Set "
-                "sap.mode=prune or sap.mode=off, or a lower sap.quantile."
+                f"Pruning with mode '{config.mode}' left none of {before:,} points. Set "
+                "sap.mode=prune or sap.mode=off, or a lower sap.quantile (from sap.large_count "
+                "points on: sap.large_factor)."
             )
         scales = point_scales(cloud.positions, context.threads)
         context.save(Points(cloud.positions, cloud.colors, cloud.normals, cloud.confidence, scales))

@@ -48,7 +48,7 @@ class Density(
         densify: AutoBool = automatic({5: False, 6: True})
         """clone and split Gaussians: few views overfit by it"""
         strategy: Literal["default", "mcmc"] = "default"
-        """densify by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"""
+        """where densify is on: by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"""
         absgrad: Literal["split", "both", "off"] = "split"
         """absolute gradients decide on: splits (AbsGS), splits and clones (gsplat), neither
         (3DGS)"""
