@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from pipeline.artifacts.cameras import Camera, Cameras
 from pipeline.artifacts.views import View, Views
+from pipeline.errors import ReconstructionError
 from pipeline.geometry.rigid import exponential
 from stages.fit.config import FitConfig
 from stages.fit.inputs.initial import Cloud, initial_gaussians
@@ -97,6 +98,32 @@ def test_a_view_adds_gaussians_where_it_shows_something_new(tmp_path) -> None:
     assert beyond.sum() > 50
     pixels, _ = cameras[2].project(here.result("gaussians").means[beyond])
     assert (pixels[:, 0] < cameras[2].width + 4).all()  # nothing that no view sees
+
+
+@pytest.mark.parametrize("blind", ["000", "002"])
+def test_a_view_that_sees_no_point_stays_where_it_is(tmp_path, blind: str) -> None:
+    truth = around()
+    shown = [
+        dataclasses.replace(view, mask=np.zeros(view.image.shape[:2], bool))
+        if view.name == blind else view
+        for view in painted(truth).views
+    ]  # fmt: skip
+    here = context(
+        tmp_path, Views(tuple(shown)), Cameras(tuple(truth)), surface(), iterations=120,
+        **PROGRESSIVE,
+    )  # fmt: skip
+    FitStage().run(here)
+    for camera in truth:
+        found = here.result("cameras").by_name()[camera.name]
+        assert degrees_between(found, camera) < (1e-4 if camera.name == blind else 0.8)
+    with pytest.raises(ReconstructionError, match="shows any of the points"):
+        none = [dataclasses.replace(v, mask=np.zeros(v.image.shape[:2], bool)) for v in shown]
+        FitStage().run(
+            context(
+                tmp_path / "none", Views(tuple(none)), Cameras(tuple(truth)), surface(),
+                iterations=3, **PROGRESSIVE,
+            )
+        )  # fmt: skip
 
 
 def test_views_that_are_still_to_be_placed_say_nothing_of_how_right_a_fit_is(tmp_path) -> None:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import ReconstructionError
 from pipeline.geometry.order import viewing_order
 from stages.fit.arrays import Array, Floats
 from stages.fit.parts.base import Part, interpolate
@@ -44,7 +45,7 @@ class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed"
     """Which frames take part yet, and how the next one is added.
 
     Attributes:
-        order: of the views.
+        order: of the views; those that see no point are not placed, and stay where they are.
         placed: how many of them take part.
         latest: iteration at which the last of those was added.
     """
@@ -71,16 +72,23 @@ class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed"
 
         super().__init__(fit)
         self.cameras = fit.scene.cameras
-        self.order = viewing_order(np.array([camera.centre for camera in self.cameras]))
         self.clouds = [
             thin(seen_by(view, camera, fit.scene.cloud.positions), self.settings.initial_points)
             for view, camera in zip(fit.scene.views, self.cameras, strict=True)
         ]
+        order = viewing_order(np.array([camera.centre for camera in self.cameras]))
+        self.order = [view for view in order if len(self.clouds[view])]
+        if not self.order:
+            raise ReconstructionError(
+                "No photograph shows any of the points where its masks leave it, so there is "
+                "nothing to begin with (fit.progressive). Look at what align and sap made."
+            )
         self.placed = 1
         held = self.order[0]
-        first = fit.poses.poses[held]
-        fit.packed = self._gaussians(held, first)
-        fit.poses = PoseOptimizer(np.repeat(first[None], len(self.order), 0), held)
+        poses = fit.poses.poses
+        fit.packed = self._gaussians(held, poses[held])
+        poses[self.order] = poses[held]
+        fit.poses = PoseOptimizer(poses, held)
 
     def begin(self, fit: Trainer) -> None:
         """Place the frames that are due before the next iteration."""
