@@ -103,8 +103,8 @@ def _about_unseen(metrics: Metrics) -> Iterator[Fact]:
     unsupported = [scores.mean.get("unsupported") for scores in blocks.values()]
     if unsupported and unsupported[0] is not None:
         yield Fact(
-            f"Of what the held-out photographs show, {100 * unsupported[0]:.1f} % lies where no "
-            "input photograph saw anything: there the picture is a guess."
+            f"Of what the scene shows of them, {100 * unsupported[0]:.1f} % was seen by no input "
+            "photograph: there the picture is a guess."
         )
     novel = metrics.part("novel")
     if novel.get("views"):

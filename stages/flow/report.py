@@ -37,14 +37,15 @@ def pairs(case: Case) -> Iterator[Section]:
     blocks: list[Block] = [
         Legend(
             wheel, "Hue is the direction in which a spot moves to the next photograph, saturation "
-            "how far. Grey is not trusted: there the two directions of flow disagree.",
+            "how far. Grey is not trusted: the two directions of flow disagree there, or it is "
+            "masked, without texture, or hidden in the other photograph.",
         )
     ]  # fmt: skip
     step = max(1, -(-len(artifact.pairs) // MOST_PAIRS))
     shown = artifact.pairs[::step]
     for pair in shown:
-        full, largest = flow_colors(pair.forward)
         trusted, largest = flow_colors(pair.forward, pair.mask_forward)
+        full, _ = flow_colors(pair.forward, largest=largest)
         first, second = labels.get(pair.name_i, pair.name_i), labels.get(pair.name_j, pair.name_j)
         share = float(pair.mask_forward.mean())
         tiles = []
@@ -64,13 +65,16 @@ def pairs(case: Case) -> Iterator[Section]:
 
 
 def flow_colors(
-    flow: npt.NDArray[np.float32], trusted: npt.NDArray[np.bool_] | None = None
+    flow: npt.NDArray[np.float32],
+    trusted: npt.NDArray[np.bool_] | None = None,
+    largest: float | None = None,
 ) -> tuple[Image, float]:
     """Flow [H, W, 2] as colours: hue is the direction, saturation the length.
 
     Args:
         flow: pixels.
         trusted: [H, W]; other pixels turn grey.
+        largest: the length in pixels that has full saturation; None: that of nearly all.
 
     Returns:
         ([H, W, 3] uint8, the length in pixels that has full saturation).
@@ -78,7 +82,8 @@ def flow_colors(
     length = np.linalg.norm(flow, axis=-1)
     finite = np.isfinite(length)
     usable = finite if trusted is None or not trusted.any() else finite & trusted
-    largest = float(np.percentile(length[usable], 98)) if usable.any() else 1.0
+    if largest is None:
+        largest = float(np.percentile(length[usable], 98)) if usable.any() else 1.0
     largest = max(largest, 1e-6)
     safe = np.where(finite[..., None], flow, 0)
     angle = (np.degrees(np.arctan2(safe[..., 1], safe[..., 0])) % 360) / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from pipeline.artifacts.flow import Flow, FlowPair
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
 from pipeline.stage import LocalContext
+from stages.flow import report
 from stages.flow.geometry import occluded, predicted_flow
 from stages.flow.stage import LEAST_WINDOW, FlowConfig, FlowStage
 from tests.stages import flow_scene as scene
@@ -219,3 +221,19 @@ def test_a_window_that_leaves_nothing_of_a_photograph_is_refused():
         FlowConfig(contrast_window=LEAST_WINDOW / 2)
     for window in (0, LEAST_WINDOW):
         assert FlowConfig(contrast_window=window).contrast_window == window
+
+
+def test_both_pictures_of_a_pair_have_the_scale_that_is_said(monkeypatch) -> None:
+    """Wild flow that nobody trusts took the colour from the rest in one of them."""
+    flow = np.zeros((8, 8, 2), np.float32)
+    flow[:4, :, 0], flow[4:, :, 0] = 5, 400
+    trusted = np.zeros((8, 8), bool)
+    trusted[:4] = True
+    pair = FlowPair("000", "001", flow, -flow, trusted, trusted)
+    drawn: list[np.ndarray] = []
+    monkeypatch.setattr(report, "picture", lambda image, *_: drawn.append(image))
+    case = SimpleNamespace(latest={"flow": Flow((pair,))}.get, labels={})
+    (section,) = report.pairs(case)
+    _, full, shown = drawn
+    assert np.array_equal(full[:4], shown[:4]) and not np.array_equal(full[4:], shown[4:])
+    assert "full colour: 5 px" in str(section)
