@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.gaussians import Gaussians, Light
+from stages.splatting.kernels.projection import CHUNK
 from stages.splatting.kernels.shading import (
-    CHUNK,
     GLOBALS,
     LIT_COLUMNS,
     MATERIAL_COLUMNS,

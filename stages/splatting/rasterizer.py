@@ -29,9 +29,9 @@ from stages.splatting.kernels.projection import (
     HARMONICS,
     SCREEN_COLUMNS,
     SCREEN_GRADIENTS,
-    project_backward,
     project_forward,
 )
+from stages.splatting.kernels.projection_back import project_backward
 from stages.splatting.kernels.tiles import TILE, count_tiles, fill_tiles, list_tiles, order_by_depth
 from stages.splatting.threads import KERNELS, use_threads, workers
 

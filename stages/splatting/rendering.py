@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians
 from pipeline.kernels import kernel
 from stages.splatting.harmonics import harmonics
-from stages.splatting.kernels.features import HARMONICS
+from stages.splatting.kernels.projection import HARMONICS
 from stages.splatting.light import LitScene
 from stages.splatting.rasterizer import Rendering, Viewpoint, pack, rasterize, use_threads
 

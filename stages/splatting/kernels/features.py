@@ -13,13 +13,12 @@ import numpy.typing as npt
 from numba import prange
 
 from pipeline.kernels import helper, kernel
+from stages.splatting.kernels.projection import CAMERA_GRADIENTS, CHUNK, HARMONICS
 
 Floats = npt.NDArray[np.float32]
 F = np.float32
-HARMONICS = 11
-CHUNK = 256
-CAMERA_GRADIENTS = 10
 
+#: of the harmonics, by degree; a colour is .5 + C0 times its constant
 C0 = F(0.28209479177387814)
 C1 = F(0.4886025119029199)
 C20, C21, C22 = F(1.0925484305920792), F(0.31539156525252005), F(0.5462742152960396)

@@ -9,7 +9,8 @@ import numpy.typing as npt
 from numba import prange
 
 from pipeline.kernels import helper, kernel
-from stages.splatting.kernels.projection import HARMONICS
+from stages.splatting.kernels.features import C0
+from stages.splatting.kernels.projection import CHUNK, HARMONICS
 from stages.splatting.lanes.types import WIDTH
 from stages.splatting.lanes.vectors import (
     at_least,
@@ -23,16 +24,12 @@ from stages.splatting.lanes.vectors import (
 Floats = npt.NDArray[np.float32]
 F = np.float32
 
-#: Gaussians per chunk: the unit of parallel work, so that sums don't depend on threads
-CHUNK = 256
 #: columns of a packed scene whose colour is written by `shade`
 LIT_COLUMNS = HARMONICS + 3
 #: columns of a material matrix: albedo 3, normal 3 (of any length)
 MATERIAL_COLUMNS = 6
 #: globals that get gradients: k, p, m and s of the narrow lobe, m and s of the broad one
 GLOBALS = 6
-#: constant harmonic; colour = 0.5 + C0 * coefficient
-C0 = F(0.28209479177387814)
 #: below these, albedo and radiance are held: roots have no slope at zero
 MIN_ALBEDO, MIN_RADIANCE = F(1e-3), F(1e-5)
 #: natural logarithm of 2

@@ -1,7 +1,6 @@
 """Tiles of 32 x 32 pixels in blocks of 4 x 4, one vector of 16 lanes each, inside numba kernels.
 
 A row of blocks is a byte of a number of 64 bits: the blocks that a Gaussian touches are one number.
-As with `lanes`: after a change here, touch the files of the kernels.
 """
 
 from __future__ import annotations
