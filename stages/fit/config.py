@@ -95,7 +95,7 @@ class Basics(PartSettings):
     divergence_factor: Annotated[float, Field(gt=1)] = 5.0
     """stop where the loss (running mean) exceeds its best by this factor"""
     preview_every: Whole = 250
-    """iterations between pictures of one view, beside the loss curve; 0: none"""
+    """iterations between pictures of one view, which go with the loss curve; 0: neither"""
 
 
 class FitConfig(

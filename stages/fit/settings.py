@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -53,7 +54,7 @@ def automatic(
             in words, where no table says it.
         held: what it comes to on a held surface, if that is something else.
         grows: `held` is for views of `PIXELS`, and grows with their width.
-        ge, **bounds: of what the user may say.
+        ge, **bounds: of what the user may say, if that is a number.
     """
     if isinstance(views, str):
         extra: dict[str, Any] = {"auto": views}
@@ -62,17 +63,18 @@ def automatic(
             "auto": _told(views, held) + (" of 512 px (more on wider views)" if grows else ""),
             "views": dict(views), "held": held, "grows": grows,
         }  # fmt: skip
-    return Field(AUTO, json_schema_extra=extra, ge=ge, **bounds)
+    switch = not isinstance(views, str) and isinstance(next(iter(views.values())), bool)
+    return Field(AUTO, json_schema_extra=extra, ge=None if switch else ge, **bounds)
 
 
 def _told(views: Mapping[int, Any], held: Any) -> str:
-    """What a rule says, in words."""
-    (first, least), *others = views.items()
+    """What a rule says, in words, and as a user would say it."""
+    (first, least), *others = ((count, json.dumps(value)) for count, value in views.items())
     words = [f"{least} up to {first} views" if others else f"{least}"]
     words += [f"{value} at {count}" for count, value in others[:-1]]
-    between = "" if isinstance(least, bool) else ", in proportion between them"
+    between = "" if least in ("true", "false") else ", in proportion between them"
     words += [f"{value} from {count}{between}" for count, value in others[-1:]]
-    return ", ".join(words) + ("" if held is None else f"; {held} on a held surface")
+    return ", ".join(words) + ("" if held is None else f"; {json.dumps(held)} on a held surface")
 
 
 def by_rule(views: Mapping[int, Any], count: int) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, get_args
 
 import pytest
+from annotated_types import Ge
 from pydantic import ValidationError
 
 from pipeline.config import Config, load_config, result_fields
@@ -129,6 +131,14 @@ def test_every_setting_says_what_it_means_and_what_auto_is() -> None:
     text = FitConfig.model_fields["initial_points"].description
     assert text is not None and "15000 up to 3 views, 30000 from 6" in text
     assert "30000 on a held surface" in text
+
+
+def test_switches_are_told_as_a_user_says_them() -> None:
+    """Not 'true or false ≥ 0', nor 'False up to 5 views'."""
+    for name, field in FitConfig.model_fields.items():
+        assert not {"True", "False"} & set(re.findall(r"\w+", str(field.description))), name
+        if bool in get_args(field.annotation):
+            assert not any(isinstance(bound, Ge) for bound in field.metadata), name
 
 
 def test_what_auto_comes_to_follows_the_number_of_views_without_steps() -> None:

@@ -60,7 +60,8 @@ class Surface(
 
     class Settings(PartSettings):
         hold_surface: AutoBool = automatic(
-            f"up to {FEW_VIEWS} views, one or more of them {LONELY:g} degrees from the others"
+            f"up to {FEW_VIEWS} views, one or more of them {LONELY:g} degrees from the others",
+            ge=None,
         )
         """keep Gaussians flat and on the surface of the input points, in proportion to
         confidence"""
