@@ -35,7 +35,7 @@ class EvaluateConfig(StageConfig):
         "transforms.json or the folder of a COLMAP model. Its contents count, not its place.",
     )
     mesh: GivenPath | None = runtime(
-        None, description="True surface (.ply) in the world of the ground truth."
+        None, description="True surface (.ply, .stl or .obj) in the world of the ground truth."
     )
     masks: GivenPath | None = runtime(
         None,

@@ -64,7 +64,7 @@ class EvaluateStage(Stage):
 def _mesh_file(config: Any) -> Path:
     path = user_path(config.mesh, "evaluate.mesh")
     if not path.is_file():
-        raise RequestError(f"evaluate.mesh: there is no file {path}. Give a mesh as .ply.")
+        raise RequestError(f"evaluate.mesh: there is no file {path}. Give a .ply, .stl or .obj.")
     if config.ground_truth is None:
         raise RequestError(
             "evaluate.mesh is given, but not evaluate.ground_truth: without true cameras nobody "

@@ -234,7 +234,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     stage = EvaluateStage()
     for settings, words in (
         ({"ground_truth": str(tmp_path)}, "evaluate.ground_truth: .* holds no cameras"),
-        ({"mesh": str(tmp_path / "no.ply")}, "evaluate.mesh: there is no file"),
+        ({"mesh": str(tmp_path / "no.ply")}, r"mesh: there is no file .* \.ply, \.stl or \.obj"),
         ({"masks": str(tmp_path / "no")}, "evaluate.masks: there is no folder"),
         ({"masks": str(tmp_path)}, "evaluate.masks: there is no picture"),
     ):
