@@ -87,6 +87,12 @@ class FitStage(Stage):
         )  # fmt: skip
         if result.backend_note:
             context.warn(result.backend_note)
+        if settings.exposure:
+            context.warn(
+                "In the fit each photograph has an exposure of its own (gains of "
+                f"{result.figures['exposure_gains']}, fit.exposure); the scene has none. So its "
+                "PSNR of the photographs may be far lower in evaluate than in the fit (train_psnr)."
+            )
         refined = {camera.name: camera for camera in result.cameras}
         every = tuple(refined.get(camera.name, camera) for camera in cameras.cameras)
         context.save(result.gaussians)

@@ -138,6 +138,25 @@ def test_exposures_take_the_steps_of_their_own_photographs() -> None:
     assert exposure is not None and exposure.steps.tolist() == [1, 0, 1]
 
 
+def test_exposures_that_the_scene_does_not_have_are_said(tmp_path) -> None:
+    """The scene is evaluated as it is: 34 dB where the fit had 47."""
+    views, cameras, points = fit_case.case()
+    shown = [
+        replace(v, image=v.image * np.float32(g))
+        for v, g in zip(views.views, (0.6, 1, 0.9), strict=True)
+    ]
+    for exposure in (True, False):
+        here = fit_case.context(
+            tmp_path / str(exposure), Views(tuple(shown)), cameras, points, light="none",
+            exposure=exposure, exposure_lr=0.02,
+        )  # fmt: skip
+        FitStage().run(here)
+        assert ("exposure_gains" in here.figures) == exposure
+        assert [text.partition("(")[2][:20] for text in here.warnings] == (
+            [f"gains of {here.figures['exposure_gains']}"[:20]] if exposure else []
+        )
+
+
 def test_the_fit_says_that_it_did_and_can_do_without(tmp_path) -> None:
     views, cameras, points = fit_case.case()
     figures = {}

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.geometry.rigid import moved_by
 from stages.fit import numerics
 from stages.fit.arrays import Array, Floats
-from stages.fit.parts.base import Part, Step, interpolate
+from stages.fit.parts.base import Figures, Part, Step, interpolate
 from stages.fit.settings import (
     AUTO,
     AutoColour,
@@ -97,7 +97,8 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
 
     class Settings(PartSettings):
         exposure: bool = False
-        """fit a gain and a bias per view and channel, for cameras that change exposure"""
+        """fit a gain and a bias per view and channel, for cameras that change exposure; the scene
+        has their mean, and is evaluated as it is"""
         # on a held surface each of three views has some fifty steps
         exposure_lr: AutoFloat = automatic({3: 1e-3}, held=0.01, ge=None, gt=0)
         """learning rate of exposure"""
@@ -132,6 +133,10 @@ class Exposure(Part, switch="exposure", on=True, off=False, kept=("values", "mom
         self.values[:, 0] /= self.values[:, 0].mean(0)
         self.values[:, 1] -= self.values[:, 1].mean(0)
         d_image *= gain[:, None, None]
+
+    def summary(self) -> Figures:
+        gains = self.values[:, 0]
+        return {"exposure_gains": f"{gains.min():.2f} to {gains.max():.2f}"}
 
 
 class Poses(Part, switch="optimize_poses", on=True, off=False):
