@@ -29,7 +29,7 @@ from stages.evaluate.held_out import (
 from stages.evaluate.images import pictures
 from stages.evaluate.images.perceptual import Lpips
 from stages.evaluate.images.score import Figures, summary_of
-from stages.evaluate.refinement import RefinementOptions, refine_camera
+from stages.evaluate.refinement import refine_camera
 from stages.evaluate.scene import Examiner, Rendered
 from stages.evaluate.support import LEGEND, beyond
 from stages.evaluate.truth import Truth, read_truth, scoring_mask
@@ -242,7 +242,7 @@ def _held_out(
         for protocol in asked:
             if protocol == "refined":
                 camera = refine_camera(
-                    examiner.render, view.image, view.valid(), camera, depth, RefinementOptions()
+                    examiner.render, view.image, view.valid(), camera, depth
                 ).camera
             last = protocol == asked[-1]
             found.append(

@@ -33,6 +33,18 @@ _SMALLEST_ERROR = 0.002
 #: Damping of the steps, as a share of the mean curvature, and by what it grows and shrinks. A turn
 #: and a shift that undo each other hardly show: without damping they run away.
 _DAMPING, _GROWTH, _MOST_DAMPING = 0.03, 5.0, 1e4
+#: It never gets less than this.
+_LEAST_DAMPING = 1e-4
+#: Sizes, coarse to fine, as divisors of the full size. In pictures coarser than `_SHIFTS_FROM` the
+#: camera only turns: a shift looks like a turn there, and both together run away.
+_FACTORS, _SHIFTS_FROM = (8, 4, 2, 1), 2
+#: Gauss-Newton steps at each size. The last one moves the picture by less than so many pixels, or
+#: lessens the error by less than such a share.
+_STEPS, _TOLERANCE, _LEAST_GAIN = 20, 0.01, 2e-4
+#: The pyramid is gone through again, at most so often, while that lessens the error by a share.
+_ROUNDS, _ROUND_GAIN = 5, 0.05
+#: Alpha above which something is rendered, and the share of what is at the start that must stay.
+_RENDERED, _LEAST_COVERED = 0.5, 0.8
 
 
 class Picture(Protocol):
@@ -45,32 +57,6 @@ class Picture(Protocol):
     @property
     def alpha(self) -> Floats:
         """[H, W]."""
-
-
-@dataclass(frozen=True)
-class RefinementOptions:
-    """How test cameras are refined."""
-
-    #: image sizes, coarse to fine, as divisors of the full size
-    factors: tuple[int, ...] = (8, 4, 2, 1)
-    #: in pictures coarser than this the camera only turns: a shift looks like a turn there, and
-    #: both together run away
-    shifts_from: int = 2
-    #: Gauss-Newton steps at each size
-    steps: int = 20
-    #: a step that moves the picture by less than this, in pixels, is the last of its size
-    tolerance: float = 0.01
-    #: and so is one that lessens the error by less than this, relative
-    least_gain: float = 2e-4
-    #: damping of the steps never gets less than this share of the mean curvature
-    least_damping: float = 1e-4
-    #: the pyramid is gone through again, at most so often, while that lessens the error by a share
-    rounds: int = 5
-    round_gain: float = 0.05
-    #: alpha above which something is rendered
-    rendered: float = 0.5
-    #: the picture may lose so much of what is rendered at the start
-    least_covered: float = 0.8
 
 
 @dataclass(frozen=True)
@@ -92,14 +78,13 @@ class _Level:
 
     def __init__(
         self, render: Callable[[Camera], Picture], photo: Floats, valid: Bools, camera: Camera,
-        factor: int, options: RefinementOptions,
+        factor: int,
     ) -> None:  # fmt: skip
         width, height = max(1, camera.width // factor), max(1, camera.height // factor)
         self.size = (width, height)
         self.blurred = factor > 1
         #: motions that are solved for: shifts are the first three, turns the others
-        self.motions = range(6) if factor <= options.shifts_from else range(3, 6)
-        self.options = options
+        self.motions = range(6) if factor <= _SHIFTS_FROM else range(3, 6)
         self.draw = render
         self.renders = 0
         share = cv2.resize(valid.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)
@@ -117,7 +102,7 @@ class _Level:
         """The picture [H, W, 3], and where [H, W] it is compared."""
         self.renders += 1
         picture = self.draw(camera.resized(*self.size))
-        seen = np.asarray(picture.alpha) > self.options.rendered
+        seen = np.asarray(picture.alpha) > _RENDERED
         return self._smooth(np.clip(picture.image, 0, 1)), self.valid & seen
 
     def error(self, image: Floats, counted: Bools) -> float:
@@ -132,7 +117,6 @@ def refine_camera(
     valid: Bools,
     camera: Camera,
     depth: float,
-    options: RefinementOptions,
 ) -> Refined:
     """Move a camera so that its picture of the scene is most like the photograph.
 
@@ -141,33 +125,32 @@ def refine_camera(
         photo: [H, W, 3] float32 in 0..1; valid: [H, W] pixels that count.
         camera: to start from, of the photograph's size.
         depth: of the scene before it, in world units: translations are relative to it.
-        options: see there.
     """
-    full = _Level(render, photo, valid, camera, 1, options)
+    full = _Level(render, photo, valid, camera, 1)
     image, counted = full.render(camera)
     before, covered = full.error(image, counted), int(counted.sum())
     best, least, renders = camera, before, 1
-    levels = [_Level(render, photo, valid, camera, factor, options) for factor in options.factors]
+    levels = [_Level(render, photo, valid, camera, factor) for factor in _FACTORS]
     last = np.inf
-    for level in levels * options.rounds:
+    for level in levels * _ROUNDS:
         if level is levels[0]:
-            if least > (1 - options.round_gain) * last:
+            if least > (1 - _ROUND_GAIN) * last:
                 break
             last = least
         if min(level.size) < SMALLEST_SIDE:
             continue
         # a coarse picture's best is not quite the sharp one's: it is left where that is no better
-        found = _descend(level, best, depth, options)
+        found = _descend(level, best, depth)
         image, counted = full.render(found)
         error = full.error(image, counted)
         renders += 1
-        if error < least and counted.sum() >= options.least_covered * covered:
+        if error < least and counted.sum() >= _LEAST_COVERED * covered:
             best, least = found, error
     renders += sum(level.renders for level in levels)
     return Refined(best, before, least, renders)
 
 
-def _descend(level: _Level, camera: Camera, depth: float, options: RefinementOptions) -> Camera:
+def _descend(level: _Level, camera: Camera, depth: float) -> Camera:
     """Damped Gauss-Newton steps on the reweighted squares at one size.
 
     The derivative serves for several steps, until one of them does not help.
@@ -178,7 +161,7 @@ def _descend(level: _Level, camera: Camera, depth: float, options: RefinementOpt
     pixel = camera.width / (level.size[0] * camera.fx)
     unit = np.array([depth, depth, depth, 1, 1, 1]) * pixel
     damping, slopes, fresh = _DAMPING, None, False
-    for _ in range(options.steps):
+    for _ in range(_STEPS):
         if not np.isfinite(error):
             break
         if slopes is None:
@@ -190,17 +173,17 @@ def _descend(level: _Level, camera: Camera, depth: float, options: RefinementOpt
         moved = replace(camera, cam_from_world=moved_by(step * unit, camera.cam_from_world))
         trial, seen = level.render(moved)
         value = level.error(trial, seen)
-        if value < error and seen.sum() >= options.least_covered * covered:
+        if value < error and seen.sum() >= _LEAST_COVERED * covered:
             gain = 1 - value / error
             camera, image, counted, error = moved, trial, seen, value
-            damping, fresh = max(damping / _GROWTH, options.least_damping), False
-            if np.abs(step).max() < options.tolerance or gain < options.least_gain:
+            damping, fresh = max(damping / _GROWTH, _LEAST_DAMPING), False
+            if np.abs(step).max() < _TOLERANCE or gain < _LEAST_GAIN:
                 break
         elif not fresh:
             slopes = None
         else:
             damping *= _GROWTH
-            if damping > _MOST_DAMPING or np.abs(step).max() < options.tolerance:
+            if damping > _MOST_DAMPING or np.abs(step).max() < _TOLERANCE:
                 break
     return camera
 

@@ -23,7 +23,7 @@ from pipeline.geometry.pose_metrics import (
 from pipeline.geometry.rigid import moved_by, rotation_angle
 from pipeline.geometry.similarity import camera_similarity, similarity
 from stages.evaluate.held_out import common_lens, register, without_lens
-from stages.evaluate.refinement import RefinementOptions, normal_equations, refine_camera
+from stages.evaluate.refinement import normal_equations, refine_camera
 from stages.splatting.rendering import render
 from tests.stages.evaluate_scene import arc, moved_world, pose, rotation, textured_scene
 
@@ -204,16 +204,12 @@ def test_refinement_finds_the_camera_again() -> None:
     valid[:, :10] = False
     spoiled = photo.copy()
     spoiled[:, :10] = 1  # what does not count must not matter
-    refined = refine_camera(
-        lambda c: render(scene, c, threads=1), spoiled, valid, start, 3.0, RefinementOptions()
-    )
+    refined = refine_camera(lambda c: render(scene, c, threads=1), spoiled, valid, start, 3.0)
     assert refined.after < 0.02 * refined.before
     between = refined.camera.rotation @ camera.rotation.T
     assert np.degrees(rotation_angle(between)) < 0.1  # of 1.2
     assert np.linalg.norm(refined.camera.centre - camera.centre) < 0.006
-    again = refine_camera(
-        lambda c: render(scene, c, threads=2), spoiled, valid, start, 3.0, RefinementOptions()
-    )
+    again = refine_camera(lambda c: render(scene, c, threads=2), spoiled, valid, start, 3.0)
     np.testing.assert_array_equal(again.camera.cam_from_world, refined.camera.cam_from_world)
 
 
@@ -237,7 +233,6 @@ def test_refinement_keeps_the_best() -> None:
     photo = np.random.default_rng(0).uniform(size=(48, 64, 3)).astype(np.float32)
     refined = refine_camera(
         lambda c: render(scene, c, threads=1), photo, np.ones((48, 64), bool), camera, 3.0,
-        RefinementOptions(),
     )  # fmt: skip
     assert refined.after <= refined.before
     assert refined.renders < 200
