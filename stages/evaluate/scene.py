@@ -43,14 +43,14 @@ class Examiner:
         config: of the stage.
         folder: for the pictures.
         regions: view name -> part that is scored by itself.
-        lpips: (render, photo) -> LPIPS, or None where there are no weights.
+        lpips: as `score_view` has it.
     """
 
     render: Callable[[Camera], Rendered]
     config: EvaluateConfig
     folder: Path
     regions: Mapping[str, Mask]
-    lpips: Callable[[Image, Image], float] | None
+    lpips: Callable[[Image, Image, Mask | None], float] | None
 
     def examine(
         self,

@@ -272,6 +272,24 @@ def test_lpips_agrees_with_torchmetrics(tmp_path: Path, monkeypatch: pytest.Monk
     assert ours(image, truth) > 0.01
 
 
+def test_lpips_of_a_masked_picture_is_that_of_what_counts(tmp_path: Path) -> None:
+    """Two thirds that are black in both pictures made it three times as good."""
+    import torch
+
+    torch.save(random_vgg(0), tmp_path / "vgg.pth")
+    lpips = Lpips.from_file(tmp_path / "vgg.pth")
+    random = np.random.default_rng(0)
+    image, truth = random.integers(0, 256, (2, 96, 192, 3)).astype(np.uint8)
+    mask = np.zeros((96, 192), bool)
+    mask[:, :64] = True
+    for picture in (image, truth):
+        picture[~mask] = 0
+    alone = lpips(image[:, :64], truth[:, :64])
+    assert lpips(image, truth, mask) == pytest.approx(alone, rel=0.1)
+    assert lpips(image, truth) < 0.5 * alone
+    assert lpips(image, truth, np.ones_like(mask)) == pytest.approx(lpips(image, truth), rel=1e-6)
+
+
 def _on_cpu(load: Any) -> Any:
     """The linear layers that torchmetrics brings were saved on a GPU."""
     return lambda file, **options: load(file, **{**options, "map_location": "cpu"})

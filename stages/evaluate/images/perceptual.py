@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import torch
 
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 #: torchvision's file name of VGG-16 trained on ImageNet, in torch's cache.
 VGG_FILE = "vgg16-397923af.pth"
@@ -108,10 +109,17 @@ class Lpips:
                 f"({type(error).__name__}: {error}). Their file is {VGG_FILE}."
             ) from error
 
-    def __call__(self, image: Image, truth: Image) -> float:
-        """LPIPS of two [H, W, 3] uint8 images of at least 16 x 16 pixels."""
+    def __call__(self, image: Image, truth: Image, mask: Mask | None = None) -> float:
+        """LPIPS of two [H, W, 3] uint8 images of at least 16 x 16 pixels.
+
+        Args:
+            image, truth: the images.
+            mask: [H, W] pixels that the mean is of, some at least; None: all. At each level a
+                feature counts by their share of what it is the place of.
+        """
         import torch
 
+        counted = torch.from_numpy(np.ones(image.shape[:2]) if mask is None else mask * 1.0)
         before = torch.get_num_threads()
         torch.set_num_threads(1)  # sums in another order would give other bytes
         try:
@@ -120,7 +128,10 @@ class Lpips:
                 levels = zip(self._features(image), self._features(truth), self.heads, strict=True)
                 for a, b, head in levels:
                     weighted = torch.nn.functional.conv2d((_unit(a) - _unit(b)) ** 2, head)
-                    distance += float(weighted.double().mean())
+                    share = torch.nn.functional.adaptive_avg_pool2d(
+                        counted[None], (weighted.shape[2], weighted.shape[3])
+                    )
+                    distance += float((weighted.double() * share).sum() / share.sum())
         finally:
             torch.set_num_threads(before)
         return distance

@@ -39,7 +39,7 @@ def score_view(
     mask: Mask,
     *,
     region: Mask | None = None,
-    lpips: Callable[[Image, Image], float] | None = None,
+    lpips: Callable[[Image, Image, Mask | None], float] | None = None,
     flip: Callable[[Image, Image], npt.NDArray[np.float32]] | None = None,
 ) -> Figures:
     """Compare a render with the photograph.
@@ -49,7 +49,7 @@ def score_view(
         alpha: [H, W] accumulated opacity of the render, 0..1.
         mask: [H, W] pixels that count.
         region: [H, W] part that is scored by itself, such as teeth; None for none.
-        lpips: (render, photo) -> LPIPS; None where there are no weights.
+        lpips: (render, photo, pixels that count) -> LPIPS; None where there are no weights.
         flip: (render, photo) -> FLIP per pixel; None to leave it out.
 
     Returns:
@@ -72,7 +72,7 @@ def score_view(
     if whole is not None:
         pair = np.where(mask[..., None], render, 0), np.where(mask[..., None], photo, 0)
     if lpips is not None and min(mask.shape) >= SMALLEST_LPIPS:
-        figures["lpips"] = lpips(*pair)
+        figures["lpips"] = lpips(*pair, whole)
     if flip is not None:
         figures["flip"] = float(flip(*pair)[mask].mean(dtype=np.float64))
     if region is not None and (region & mask).any():
