@@ -207,9 +207,9 @@ def ssim_forward(  # type: ignore[no-untyped-def]
 @helper
 def _backward_strip(  # type: ignore[no-untyped-def]
     job, image, target, mask, saturation, d_mean, d_square, d_product, l1_weight, ssim_weight,
-    d_image, across, parts,
+    d_image, across,
 ):  # fmt: skip
-    """One strip of one channel; `across` and `parts` are scratch."""
+    """One strip of one channel; `across` is scratch."""
     height, width = mask.shape[1], mask.shape[2]
     channel, y0, y1, x0, wide = _place(job, height, width)
     weights = _weights()
@@ -260,11 +260,10 @@ def ssim_backward(  # type: ignore[no-untyped-def]
     taken = np.zeros(1, np.int64)
     for _ in prange(workers):
         across = np.zeros((3, ROWS, PITCH), np.float32)
-        parts = np.zeros(LANES, np.float32)
         job = take_number(taken)
         while job < jobs:
             _backward_strip(
                 job, image, target, mask, saturation, d_mean, d_square, d_product, l1_weight,
-                ssim_weight, d_image, across, parts,
+                ssim_weight, d_image, across,
             )  # fmt: skip
             job = take_number(taken)
