@@ -85,7 +85,10 @@ class AlignStage(Stage):
         names = [view.name for view in views.views if view.name in merged]
         missing = [view.name for view in views.views if view.name not in start.cameras]
         if missing:
-            context.warn(f"not placed in the scene: view {', '.join(missing)}")
+            context.warn(
+                f"Not in the scene, as no pointmap ties them to the others: view "
+                f"{', '.join(missing)}. Photographs between them and the others would."
+            )
         masked = {
             name: np.where(by_name[name].valid(), merged[name].confidence, np.float32(1))
             for name in names
@@ -160,11 +163,12 @@ def _kept(context: StageContext) -> bool:
     cameras, points = context.load("cameras"), context.load("points")
     if len(cameras) < 2 or len(points) == 0:
         return False
-    if context.config.refine == "always":
-        context.warn(
-            "align.refine=always changes nothing: there are no pointmaps to refine the cameras by. "
-            "The cameras and points stay as init has them."
-        )
+    for setting in ("refine", "matches"):
+        if getattr(context.config, setting) == "always":
+            context.warn(
+                f"align.{setting}=always changes nothing: there are no pointmaps to refine the "
+                "cameras by. The cameras and points stay as init has them."
+            )
     context.save(cameras)
     context.save(points)
     context.summarize(points=len(points), views=len(cameras), kept="as given, without pointmaps")
