@@ -83,8 +83,9 @@ class TeethStage(Stage):
                     context.warn(f"{name} is not used to place the teeth: {dentition.set_aside}.")
         if grey and teeth.chosen:
             context.warn(
-                "The photographs have no colour: they are read as black-and-white ones. X-rays "
-                "make no scene."
+                "The photographs have no colour: they are read as black-and-white ones. Nothing "
+                "tells black-and-white photographs of two patients apart, and X-rays make no "
+                "scene: make sure that these are photographs of one patient."
             )
         context.save(teeth)
         crowns = [crown for view in teeth.chosen for crown in view.all_crowns]
