@@ -153,6 +153,16 @@ def test_a_known_focal_length_is_refined_and_left_only_for_a_good_reason(tmp_pat
         assert solution.focals[0] == pytest.approx(expected, rel=0.02)
 
 
+def test_a_focal_length_that_exif_decides_stays_in_the_last_adjustment(tmp_path):
+    given, poses = make_scene([0, 3, 6], noise=0.5, seed=2)
+    given = replace(given, lenses=[replace(given.lenses[0], focal=FOCAL)])
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    best = known_focal(solver, True, lambda *_: None)
+    found = refine_solution(solver, best, True, RefinementOptions())
+    assert found.focals[0] == pytest.approx(FOCAL, rel=0.01)
+    assert worst_rotation(found, poses) < 0.3
+
+
 @pytest.mark.parametrize("focal", [None, FOCAL])
 def test_a_photograph_with_another_zoom_gets_a_lens_of_its_own(tmp_path, focal):
     for zoom in ([1, 1, 1.4, 1, 1], [1, 1, 0.8, 1, 1], [1] * 5):

@@ -9,7 +9,7 @@ import pytest
 from stages.init.sfm.matching.two_view import Correspondences, coherent_matches
 from stages.init.sfm.options import ClassicalOptions, RefinementOptions
 from stages.init.sfm.refine import refine_solution, robust_cost
-from stages.init.sfm.solver import Solver, unknown_focal
+from stages.init.sfm.solver import Solver, known_focal, unknown_focal
 from stages.init.sfm.undistort import distort_pixels, undistort_image, undistort_pixels
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, worst_rotation
 
@@ -103,6 +103,19 @@ def test_distortion_is_found_and_taken_out(tmp_path):
         found.observed_pixel[mine][:, None] - straight.positions[1][None], axis=2
     ).min(1)
     assert np.median(nearest) < 0.5
+
+
+@pytest.mark.parametrize("factor", [0.45, 2.2])
+def test_exif_that_the_photographs_refute_does_not_hide_distortion(tmp_path, factor):
+    straight, poses = make_scene([-22, -7, 7, 20], count=600)
+    lens = replace(straight.lenses[0], focal=factor * FOCAL)
+    given = through_a_bent_lens(replace(straight, lenses=[lens]), -0.25)
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    best = known_focal(solver, True, lambda *_: None)
+    found = refine_solution(solver, best, True, RefinementOptions())
+    assert found.distortions[0] == pytest.approx(-0.25, abs=0.03)
+    assert found.focals[0] == pytest.approx(FOCAL, rel=0.02)
+    assert worst_rotation(found, poses) < 0.2
 
 
 def test_a_straight_lens_keeps_its_pinhole(tmp_path):

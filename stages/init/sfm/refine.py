@@ -42,20 +42,29 @@ def refine_solution(
 ) -> Solution:
     """Adjust a reconstruction robustly, with a radial coefficient per lens where that helps.
 
+    Focal lengths that are near EXIF's stay near; where `known_focal` has left EXIF's for a good
+    reason, EXIF says nothing here either.
+
     Args:
         solver: what it was made by.
         best: the reconstruction.
         free: the focal lengths may change.
     """
     scale = options.loss_scale * solver.pixel
+    heeded = _near_exif(solver, best)
 
-    def adjusted(found: Solution, distortions: Distortions | None) -> Solution:
+    def adjusted(found: Solution, distortions: Distortions | None, free: bool = free) -> Solution:
         return bundle_adjust(
             found, solver.given, solver.focals_of(found),
             refine_focal=free, distortions=distortions, loss_scale=scale,
         )  # fmt: skip
 
+    def believable(found: Solution) -> bool:
+        return _believable(solver, found) and (_near_exif(solver, found) or not heeded)
+
     plain = adjusted(best, None)
+    if heeded and not _near_exif(solver, plain):
+        plain = adjusted(best, None, free=False)
     if not solver.sane(plain):
         plain = best
     able = _lenses_seen_enough(solver, best, options)
@@ -64,7 +73,7 @@ def refine_solution(
     start: Distortions = [0.0 if enough else None for enough in able]
     bent = adjusted(best, start)
     gained = robust_cost(bent, scale) < (1 - options.distortion_gain) * robust_cost(plain, scale)
-    if not _believable(solver, bent) or not (gained or options.refine_distortion == "always"):
+    if not believable(bent) or not (gained or options.refine_distortion == "always"):
         return plain
     # The pairs verified and the points found anew: those at the rim were taken for errors.
     found: Distortions = [
@@ -79,7 +88,7 @@ def refine_solution(
         for k1, enough in zip(solver.distortions_of(again), able, strict=True)
     ]  # fmt: skip
     again = adjusted(again, found)
-    return again if _believable(solver, again) else bent
+    return again if believable(again) else bent
 
 
 def with_zoomed(
@@ -166,25 +175,24 @@ def _lenses_seen_enough(
     return [bool(b) for b in enough & (observations >= options.distortion_observations)]
 
 
-def _believable(solver: Solver, solution: Solution) -> bool:
-    """Focal lengths and error as a camera's, near EXIF's, and no lens that folds its image.
+def _near_exif(solver: Solver, solution: Solution) -> bool:
+    """Is the focal length of every lens near the one that is known of it, if any is?
 
-    From three photographs a radial coefficient and the focal length can trade places; EXIF decides.
+    From three photographs a focal length trades places with the distance and with a radial
+    coefficient; EXIF decides.
     """
-    lenses = list(
-        zip(
-            solver.given.lenses,
-            solver.focals_of(solution),
-            solver.distortions_of(solution),
-            strict=True,
-        )
-    )
-    if any(
-        lens.focal and abs(focal / lens.focal - 1) > EXIF_TOLERANCE for lens, focal, _ in lenses
-    ):
-        return False
+    found = zip(solver.given.lenses, solver.focals_of(solution), strict=True)
+    return all(abs(focal / (lens.focal or focal) - 1) <= EXIF_TOLERANCE for lens, focal in found)
+
+
+def _believable(solver: Solver, solution: Solution) -> bool:
+    """Focal lengths and error as a camera's, and no lens that folds its image."""
+    found = zip(
+        solver.given.lenses, solver.focals_of(solution), solver.distortions_of(solution),
+        strict=True,
+    )  # fmt: skip
     corners = [
-        1 + 3 * k1 * (lens.width**2 + lens.height**2) / (4 * focal**2) for lens, focal, k1 in lenses
+        1 + 3 * k1 * (lens.width**2 + lens.height**2) / (4 * focal**2) for lens, focal, k1 in found
     ]
     return solver.sane(solution) and min(corners) > LEAST_STRETCH
 
