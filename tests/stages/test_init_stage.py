@@ -16,7 +16,7 @@ from pipeline.geometry import cloud
 from pipeline.geometry.rigid import angle_between
 from pipeline.stage import LocalContext
 from stages.init.sfm.diagnosis import least_views
-from stages.init.sfm.matching.two_view import TwoView
+from stages.init.sfm.matching.two_view import Lens, TwoView
 from stages.init.sfm.reconstruct import Evidence, group_lenses
 from stages.init.stage import InitConfig, InitStage
 
@@ -126,6 +126,16 @@ def test_views_of_one_size_and_focal_share_a_lens():
     unknown, of_view = group_lenses([(384, 512), (384, 512)], [None, None])
     assert of_view == [0, 0]
     assert unknown[0].focal is None
+
+
+def test_rounding_by_a_pixel_makes_no_other_lens():
+    lenses, of_view = group_lenses(
+        [(341, 512), (342, 512), (342, 512), (343, 512)], [600.0, 600.1, 606.0, 600.0]
+    )
+    assert of_view == [0, 0, 1, 2]
+    assert lenses[0] == Lens(512, 341, 600.0)
+    _, of_view = group_lenses([(341, 512), (342, 512), (341, 512)], [None] * 3)
+    assert of_view == [0, 0, 0]
 
 
 def make_camera(name, shift):

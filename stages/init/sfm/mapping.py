@@ -41,6 +41,7 @@ class Solution:
         observed_pixel: [O, 2] pixels.
         residuals: [O] reprojection error in pixels.
         edges: the pairs of views that it was made from.
+        principal_points: view index -> pixels, the middle of its lens's image.
     """
 
     poses: dict[int, Array]
@@ -52,6 +53,7 @@ class Solution:
     residuals: Array
     edges: tuple[Pair, ...] = ()
     distortions: dict[int, float] = field(default_factory=dict)
+    principal_points: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
@@ -250,20 +252,19 @@ def solution_of(model: Any, edges: tuple[Pair, ...]) -> Solution:
         residuals=np.zeros(0),
         edges=edges,
         distortions=distortions,
+        principal_points={view: (lens.width / 2, lens.height / 2) for view, lens in lenses.items()},
     )
-    return with_residuals(solution, {
-        view: (lens.width / 2, lens.height / 2) for view, lens in lenses.items()
-    })  # fmt: skip
+    return with_residuals(solution)
 
 
-def with_residuals(solution: Solution, centre: dict[int, tuple[float, float]]) -> Solution:
-    """The solution with its reprojection errors, for principal points in pixels per view."""
+def with_residuals(solution: Solution) -> Solution:
+    """The solution with its reprojection errors."""
     residuals = np.zeros(len(solution.observed_point))
     for view, pose in solution.poses.items():
         mine = solution.observed_view == view
         local = solution.points[solution.observed_point[mine]] @ pose[:3, :3].T + pose[:3, 3]
         depth = np.where(np.abs(local[:, 2]) < 1e-12, 1e-12, local[:, 2])
-        pixel = local[:, :2] / depth[:, None] * solution.focals[view] + np.array(centre[view])
+        pixel = local[:, :2] / depth[:, None] * solution.focals[view] + solution.principal_points[view]
         residuals[mine] = np.linalg.norm(pixel - solution.observed_pixel[mine], axis=1)
         residuals[mine] = np.where(local[:, 2] > 0, residuals[mine], np.inf)
     return replace(solution, residuals=residuals)
