@@ -20,6 +20,7 @@ from stages.init.placement import Placement
 from stages.init.sfm.diagnosis import HOW_TO_SHOOT, Limits, failure, warnings_of
 from stages.init.sfm.matching.features import Features
 from stages.init.sfm.matching.pictures import Links, match_pictures
+from stages.init.sfm.matching.roll import rolls_of_cameras
 from stages.init.sfm.matching.two_view import Correspondences
 from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions, RefinementOptions
 from stages.init.sfm.reconstruct import Attempt, find_features, match_views, reconstruct
@@ -176,14 +177,24 @@ def place_known(
         warn(f"The model has no camera of {', '.join(without)}; left out.")
     pairs = [as_pinhole(view, known[view.name], CAMERAS) for view in views if view.name in known]
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
-    features = find_features(
-        [view.gray() for view in placed], [view.valid() for view in placed], options, threads,
-        progress, scratch=scratch,
-    )  # fmt: skip
     pixel = max(max(view.width, view.height) for view in placed) / REFERENCE_SIDE
-    matches = match_views(features, ordered, options, pixel, threads, progress)
     max_error = options.max_reprojection_error * pixel
-    chosen = agreeing_matches(cameras, matches, max_error)
+
+    def matched(
+        rolls: list[float],
+    ) -> tuple[list[Features], dict[Pair, Correspondences], dict[Pair, npt.NDArray[np.int64]]]:
+        features = find_features(
+            [view.gray() for view in placed], [view.valid() for view in placed], options, threads,
+            progress, rolls, scratch,
+        )  # fmt: skip
+        matches = match_views(features, ordered, options, pixel, threads, progress)
+        return features, matches, agreeing_matches(cameras, matches, max_error)
+
+    features, matches, chosen = matched([0.0] * len(placed))
+    linked = [pair for pair, those in chosen.items() if len(those) >= options.min_inliers]
+    rolls = rolls_of_cameras(cameras, linked)
+    if any(rolls):
+        features, matches, chosen = matched(rolls)
     tracks = link_tracks(
         [feature.positions for feature in features], [feature.points for feature in features],
         matches, chosen,

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.space.scale import NO_SCALE, Scale
@@ -21,9 +22,11 @@ from pipeline.geometry.models.known_cameras import (
     read_cameras,
 )
 from pipeline.stage import LocalContext
+from stages.init.place import place_known
 from stages.init.scale import mm_per_unit
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.init.sfm.matching.two_view import Correspondences
+from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
 from stages.init.stage import InitConfig, InitStage
 from stages.init.write import place_in
@@ -241,6 +244,33 @@ def test_cameras_of_other_photographs_are_noticed(tmp_path):
     shuffled.write_text(str(folder))
     with pytest.raises(ReconstructionError, match="do not fit the photographs"):
         run(tmp_path / "out", folder)
+
+
+@pytest.mark.parametrize("quarters", [1, 2])
+def test_cameras_of_rolled_photographs_fit(tmp_path, quarters):
+    """A phone held upside down or on its side; the cameras say so."""
+    views = list(sample_views().views)
+    frames = [dict(frame) for frame in TRUTH["frames"]]
+    image = np.ascontiguousarray(np.rot90(views[1].image, -quarters))
+    size = image.shape[1::-1]
+    views[1] = replace(
+        views[1], image=image, source_size=size, mask=None, working_from_source=np.eye(3)
+    )
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("z", 90 * quarters, degrees=True).as_matrix()
+    pose = np.linalg.inv(turned @ np.array(frames[1]["w2c_opencv"])) @ np.diag([1, -1, -1, 1])
+    frames[1] |= {"transform_matrix": pose.tolist(), "w": size[0], "h": size[1]}
+    frames[1] |= {"cx": size[0] / 2, "cy": size[1] / 2}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**TRUTH, "frames": frames}))
+    known = matching_cameras(read_cameras([path])[0], views)
+    warned = []
+    placement = place_known(
+        views, known, NO_SCALE, False, ClassicalOptions(), threads=2, progress=lambda *_: None,
+        warn=warned.append,
+    )  # fmt: skip
+    assert warned == []
+    assert min(len(seen) for seen in placement.seen) > 100
 
 
 def test_photographs_without_camera_are_named(tmp_path):

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from pipeline.artifacts.cameras import Camera
 from stages.init.sfm.matching.features import detect_features, turned_back
 from stages.init.sfm.matching.match import match_features
-from stages.init.sfm.matching.roll import find_rolls, groups, relative_roll
+from stages.init.sfm.matching.roll import find_rolls, groups, relative_roll, rolls_of_cameras
 from stages.init.sfm.matching.two_view import unrolled
-from tests.stages.init_scene import texture
+from tests.stages.init_scene import orbit, texture
 
 SIZE = (200, 260)
 
@@ -75,6 +77,18 @@ def test_strangers_have_no_roll_and_threads_change_nothing():
     assert one == two
     assert one[:2] == [0.0, 0.0]
     assert abs(one[2] - 60) < 5
+
+
+def test_known_cameras_tell_rolls_where_links_are_missing():
+    rolls = [0.0, 0.0, 90.0, 180.0]
+    cameras = []
+    for number, (pose, roll) in enumerate(zip(orbit([-10, 0, 10, 20]), rolls, strict=True)):
+        turned = np.eye(4)
+        turned[:3, :3] = Rotation.from_euler("z", roll, degrees=True).as_matrix()
+        cameras.append(Camera(str(number), 200, 160, 180.0, 180.0, 100.0, 80.0, turned @ pose))
+    found = np.array(rolls_of_cameras(cameras, [(0, 1)]))
+    assert np.abs((found - rolls + 180) % 360 - 180).max() < 5
+    assert rolls_of_cameras(cameras, [(0, 1), (1, 2), (1, 3)]) == [0.0] * 4
 
 
 def test_no_matches_say_nothing():

@@ -264,7 +264,9 @@ def with_residuals(solution: Solution) -> Solution:
         mine = solution.observed_view == view
         local = solution.points[solution.observed_point[mine]] @ pose[:3, :3].T + pose[:3, 3]
         depth = np.where(np.abs(local[:, 2]) < 1e-12, 1e-12, local[:, 2])
-        pixel = local[:, :2] / depth[:, None] * solution.focals[view] + solution.principal_points[view]
+        pixel = (
+            local[:, :2] / depth[:, None] * solution.focals[view] + solution.principal_points[view]
+        )
         residuals[mine] = np.linalg.norm(pixel - solution.observed_pixel[mine], axis=1)
         residuals[mine] = np.where(local[:, 2] > 0, residuals[mine], np.inf)
     return replace(solution, residuals=residuals)

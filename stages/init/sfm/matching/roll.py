@@ -7,13 +7,15 @@ upright features of the photograph turned back then do the work.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
+from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.graph import Pair
 from pipeline.kernels.threads import in_threads
 from stages.init.sfm.matching.features import Features, oriented_features
@@ -65,15 +67,14 @@ def find_rolls(
     """
     count = len(grays)
     group = groups(linked, count)
-    rolls = [0.0] * count
     if len(set(group)) == 1:
-        return rolls
+        return [0.0] * count
 
     def detect(view: int) -> tuple[Features, npt.NDArray[np.float64]]:
         return oriented_features(grays[view], valid[view], peak_threshold, ORIENTED_FEATURES)
 
     features = in_threads(detect, range(count), threads)
-    pairs = [(i, j) for i in range(count) for j in range(i + 1, count) if group[i] != group[j]]
+    pairs = [(i, j) for i, j in combinations(range(count), 2) if group[i] != group[j]]
 
     def compare(pair: Pair) -> RelativeRoll:
         (first, turns_i), (second, turns_j) = features[pair[0]], features[pair[1]]
@@ -87,12 +88,31 @@ def find_rolls(
         answers = in_threads(
             compare, pairs, threads, lambda done: progress("rolled photographs", done, len(pairs))
         )
-    told = dict(zip(pairs, answers, strict=True))
+    return _rolls_across(group, dict(zip(pairs, answers, strict=True)))
+
+
+def rolls_of_cameras(cameras: Sequence[Camera], linked: list[Pair]) -> list[float]:
+    """As `find_rolls`, for N cameras that are known; those that look alike say it."""
+    group = groups(linked, len(cameras))
+    told = {}
+    for i, j in combinations(range(len(cameras)), 2):
+        if group[i] == group[j]:
+            continue
+        turn = cameras[j].rotation @ cameras[i].rotation.T
+        roll = np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+        away = np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1)))
+        told[i, j] = RelativeRoll(float(roll), round(180 - float(away)))
+    return _rolls_across(group, told)
+
+
+def _rolls_across(group: list[int], told: dict[Pair, RelativeRoll]) -> list[float]:
+    """Rolls [N] of views against their largest group, by what pairs of different groups say."""
+    rolls = [0.0] * len(group)
     sizes = {number: group.count(number) for number in group}
     known = {max(sizes, key=lambda number: (sizes[number], -number))}
     while True:
         open_pairs = [
-            (i, j) for i, j in pairs
+            (i, j) for i, j in told
             if (group[i] in known) != (group[j] in known) and told[i, j].votes >= LEAST_VOTES
         ]  # fmt: skip
         if not open_pairs:
@@ -101,7 +121,7 @@ def find_rolls(
         forward = group[i] in known
         joined = group[j] if forward else group[i]
         roll = rolls[i] + told[i, j].degrees if forward else rolls[j] - told[i, j].degrees
-        for view in range(count):
+        for view in range(len(group)):
             if group[view] == joined:
                 rolls[view] = roll
         known.add(joined)
