@@ -8,7 +8,7 @@ import pytest
 
 from stages.init.sfm.matching.two_view import Correspondences, coherent_matches
 from stages.init.sfm.options import ClassicalOptions, RefinementOptions
-from stages.init.sfm.refine import refine_solution, robust_cost
+from stages.init.sfm.refine import bundle_adjust, refine_solution, robust_cost
 from stages.init.sfm.solver import Solver, known_focal, unknown_focal
 from stages.init.sfm.undistort import distort_pixels, undistort_image, undistort_pixels
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, worst_rotation
@@ -116,6 +116,45 @@ def test_exif_that_the_photographs_refute_does_not_hide_distortion(tmp_path, fac
     assert found.distortions[0] == pytest.approx(-0.25, abs=0.03)
     assert found.focals[0] == pytest.approx(FOCAL, rel=0.02)
     assert worst_rotation(found, poses) < 0.2
+
+
+def test_errors_are_those_of_the_photograph(tmp_path):
+    """Straightened, the rim of a barrel is enlarged: errors there hid that the lens fits better."""
+    given = through_a_bent_lens(make_scene([-8, 0, 8], count=600, noise=0.4, seed=3)[0], -0.25)
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    best = solver.solve([FOCAL], False)
+    plain, bent = (
+        bundle_adjust(
+            best, given, [FOCAL], refine_focal=False, distortions=distortions, loss_scale=0.5
+        )
+        for distortions in (None, [0.0])
+    )
+    assert robust_cost(bent, 0.5) < 0.99 * robust_cost(plain, 0.5)
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT,
+        params=[bent.focals[1], WIDTH / 2, HEIGHT / 2, bent.distortions[1]],
+    )  # fmt: skip
+    mine = bent.observed_view == 1
+    pose, places = bent.poses[1], bent.points[bent.observed_point[mine]]
+    shown = camera.img_from_cam(places @ pose[:3, :3].T + pose[:3, 3])
+    photographed = distort_pixels(
+        bent.observed_pixel[mine], bent.focals[1], bent.distortions[1], SIZE
+    )  # fmt: skip
+    missed = np.linalg.norm(shown - photographed, axis=1)
+    np.testing.assert_allclose(bent.residuals[mine], missed, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_distortion_is_found_beside_a_focal_length_that_exif_decides(tmp_path, seed):
+    straight, poses = make_scene([-8, 0, 8], count=600, noise=0.4, seed=seed)
+    lens = replace(straight.lenses[0], focal=FOCAL)
+    given = through_a_bent_lens(replace(straight, lenses=[lens]), -0.25)
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    best = known_focal(solver, True, lambda *_: None)
+    found = refine_solution(solver, best, True, RefinementOptions())
+    assert found.focals[0] == pytest.approx(FOCAL, rel=0.02)
+    assert found.distortions[0] == pytest.approx(-0.25, abs=0.03)
+    assert worst_rotation(found, poses) < 0.5 * worst_rotation(best, poses)
 
 
 def test_a_straight_lens_keeps_its_pinhole(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from pipeline.geometry.models.colmap import quiet_pycolmap
 from stages.init.sfm.mappers import MapperOptions, global_models, incremental_models
 from stages.init.sfm.matching.features import Features
 from stages.init.sfm.matching.two_view import Correspondences, Lens, TwoView
-from stages.init.sfm.undistort import undistort_pixels
+from stages.init.sfm.undistort import distort_pixels, undistort_pixels
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -39,7 +39,7 @@ class Solution:
         observed_point: [O] int64, point of each observation.
         observed_view: [O] int64, view of each observation.
         observed_pixel: [O, 2] pixels.
-        residuals: [O] reprojection error in pixels.
+        residuals: [O] reprojection error in pixels of the photograph.
         edges: the pairs of views that it was made from.
         principal_points: view index -> pixels, the middle of its lens's image.
     """
@@ -236,37 +236,31 @@ def solution_of(model: Any, edges: tuple[Pair, ...]) -> Solution:
         for view, lens in lenses.items()
     }
     focals = {view: float(lens.focal_length) for view, lens in lenses.items()}
+    residuals = np.zeros(len(pixels))
+    places = np.array(points, np.float64).reshape(-1, 3)
+    numbers = np.array(observed_point, np.int64)
     for view, lens in lenses.items():
+        mine, size = views == view, (lens.width, lens.height)
+        bend = focals[view], distortions[view], size
+        local = places[numbers[mine]] @ poses[view][:3, :3].T + poses[view][:3, 3]
+        depth = np.where(np.abs(local[:, 2]) < 1e-12, 1e-12, local[:, 2])
+        seen = local[:, :2] / depth[:, None] * focals[view] + np.array(size) / 2
+        # in the photograph: straightened, the rim of a barrel is larger, and so are its errors
         if distortions[view]:
-            mine = views == view
-            pixels[mine] = undistort_pixels(
-                pixels[mine], focals[view], distortions[view], (lens.width, lens.height)
-            )
-    solution = Solution(
+            seen = distort_pixels(seen, *bend)
+        missed = np.linalg.norm(seen - pixels[mine], axis=1)
+        residuals[mine] = np.where(local[:, 2] > 0, missed, np.inf)
+        if distortions[view]:
+            pixels[mine] = undistort_pixels(pixels[mine], *bend)
+    return Solution(
         poses=poses,
         focals=focals,
-        points=np.array(points, np.float64).reshape(-1, 3),
-        observed_point=np.array(observed_point, np.int64),
+        points=places,
+        observed_point=numbers,
         observed_view=views,
         observed_pixel=pixels,
-        residuals=np.zeros(0),
+        residuals=residuals,
         edges=edges,
         distortions=distortions,
         principal_points={view: (lens.width / 2, lens.height / 2) for view, lens in lenses.items()},
     )
-    return with_residuals(solution)
-
-
-def with_residuals(solution: Solution) -> Solution:
-    """The solution with its reprojection errors."""
-    residuals = np.zeros(len(solution.observed_point))
-    for view, pose in solution.poses.items():
-        mine = solution.observed_view == view
-        local = solution.points[solution.observed_point[mine]] @ pose[:3, :3].T + pose[:3, 3]
-        depth = np.where(np.abs(local[:, 2]) < 1e-12, 1e-12, local[:, 2])
-        pixel = (
-            local[:, :2] / depth[:, None] * solution.focals[view] + solution.principal_points[view]
-        )
-        residuals[mine] = np.linalg.norm(pixel - solution.observed_pixel[mine], axis=1)
-        residuals[mine] = np.where(local[:, 2] > 0, residuals[mine], np.inf)
-    return replace(solution, residuals=residuals)

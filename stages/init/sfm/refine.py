@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from stages.init.sfm.solver import EXIF_TOLERANCE, Solver
 from stages.init.sfm.undistort import distort_pixels
 
 Array = npt.NDArray[np.float64]
+Found = TypeVar("Found", Solution, Solution | None)
 
 #: A lens that shrinks its corners, relative to its middle, to less than this share is a wrong guess
 #: (fisheye lenses need another model).
@@ -53,18 +55,19 @@ def refine_solution(
     scale = options.loss_scale * solver.pixel
     heeded = _near_exif(solver, best)
 
-    def adjusted(found: Solution, distortions: Distortions | None, free: bool = free) -> Solution:
-        return bundle_adjust(
+    def near_exif(find: Callable[[bool], Found]) -> Found:
+        """With free focal lengths, if they may be, or held ones where free ones leave EXIF's."""
+        found = find(free)
+        left = free and heeded and found is not None and not _near_exif(solver, found)
+        return find(False) if left else found
+
+    def adjusted(found: Solution, distortions: Distortions | None) -> Solution:
+        return near_exif(lambda free: bundle_adjust(
             found, solver.given, solver.focals_of(found),
             refine_focal=free, distortions=distortions, loss_scale=scale,
-        )  # fmt: skip
-
-    def believable(found: Solution) -> bool:
-        return _believable(solver, found) and (_near_exif(solver, found) or not heeded)
+        ))  # fmt: skip
 
     plain = adjusted(best, None)
-    if heeded and not _near_exif(solver, plain):
-        plain = adjusted(best, None, free=False)
     if not solver.sane(plain):
         plain = best
     able = _lenses_seen_enough(solver, best, options)
@@ -73,14 +76,16 @@ def refine_solution(
     start: Distortions = [0.0 if enough else None for enough in able]
     bent = adjusted(best, start)
     gained = robust_cost(bent, scale) < (1 - options.distortion_gain) * robust_cost(plain, scale)
-    if not believable(bent) or not (gained or options.refine_distortion == "always"):
+    if not _believable(solver, bent) or not (gained or options.refine_distortion == "always"):
         return plain
     # The pairs verified and the points found anew: those at the rim were taken for errors.
     found: Distortions = [
         k1 if enough else None
         for k1, enough in zip(solver.distortions_of(bent), able, strict=True)
     ]  # fmt: skip
-    again = solver.solve(solver.focals_of(bent), free, distortions=found)
+    again = near_exif(
+        lambda free: solver.solve(solver.focals_of(bent), free, distortions=found)
+    )  # fmt: skip
     if again is None or len(again.poses) < len(best.poses):
         return bent
     found = [
@@ -88,7 +93,7 @@ def refine_solution(
         for k1, enough in zip(solver.distortions_of(again), able, strict=True)
     ]  # fmt: skip
     again = adjusted(again, found)
-    return again if believable(again) else bent
+    return again if _believable(solver, again) else bent
 
 
 def with_zoomed(
