@@ -81,9 +81,15 @@ def densify(context: StageContext, views: Views, placement: Placement) -> None:
     ]
     dense_count = sum(len(found) for found in clouds)
     if dense_count < config.min_dense_points:
+        advice = ""
+        if options.method == "sgbm":
+            advice = (
+                " init.dense.method=sgbm sees little between cameras far apart, and nothing where "
+                "one stands ahead of the other. Leave it out: the plane sweep does."
+            )
         context.warn(
             f"Dense stereo found only {dense_count} points; the {len(points)} points of the sparse "
-            "reconstruction are added. The surface will have holes."
+            f"reconstruction are added. The surface will have holes.{advice}"
         )
         clouds.append(cloud.sparse_points(points, images, list(cameras)))
     if config.fill_step:

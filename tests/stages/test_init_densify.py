@@ -10,6 +10,7 @@ from pipeline.stage import LocalContext
 from stages.init import densify
 from stages.init.config import InitConfig
 from stages.init.dental.reconstruct import PlacedTeeth
+from stages.init.placement import Placement
 from stages.stereo.options import DenseView
 from tests.stages.init_teeth_case import (
     FOCAL,
@@ -44,6 +45,26 @@ def context(tmp_path, teeth=None, **settings):
 def test_three_photographs_of_teeth_are_completed(tmp_path, count, teeth, settings, expected):
     asked = context(tmp_path, teeth, **settings)
     assert densify.few_of_teeth(asked, photographs(count)) is expected
+
+
+@pytest.mark.parametrize("method", ["sgbm", "sweep"])
+def test_the_quick_preview_says_what_it_can_not_see(tmp_path, method):
+    """A camera that moves ahead leaves nothing to rectify."""
+    asked = context(tmp_path, dense={"method": method})
+    height, width = SIZE
+    ahead = np.eye(4)
+    ahead[2, 3] = -0.5
+    poses = [
+        Camera(f"{k:03d}", width, height, FOCAL, FOCAL, width / 2, height / 2, pose)
+        for k, pose in enumerate((np.eye(4), ahead))
+    ]
+    corner = np.array([0.5 * width / FOCAL, 0.5 * height / FOCAL, 1.0])
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (60, 3)) * corner * 3 + (0, 0, 4)
+    views = photographs(2)
+    seen = (np.arange(60),) * 2
+    densify.densify(asked, views, Placement(views.views, tuple(poses), points, seen, {(0, 1): 60}))
+    assert any("sparse reconstruction are added" in text for text in asked.warnings)
+    assert any("plane sweep" in text for text in asked.warnings) is (method == "sgbm")
 
 
 def cameras():
