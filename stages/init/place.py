@@ -122,8 +122,7 @@ def _from_attempt(views: list[View], attempt: Attempt) -> Placement:
         Camera(
             name=view.name, width=view.width, height=view.height,
             fx=solution.focals[index], fy=solution.focals[index],
-            cx=solution.principal_points[index][0], cy=solution.principal_points[index][1],
-            cam_from_world=solution.poses[index],
+            cx=view.width / 2, cy=view.height / 2, cam_from_world=solution.poses[index],
         )
         for index, view in zip(order, placed, strict=True)
     ]  # fmt: skip

@@ -10,7 +10,8 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.graph import spanning_pairs
 from stages.init.placement import Placement
 from stages.init.sfm.focal import better, search_focal
-from stages.init.sfm.mapping import Solution, map_views
+from stages.init.sfm.mapping import MappingInput, Solution, map_views
+from stages.init.sfm.matching.features import Features
 from stages.init.sfm.matching.two_view import (
     Correspondences,
     Lens,
@@ -21,6 +22,7 @@ from stages.init.sfm.matching.two_view import (
     verify_pair,
 )
 from stages.init.sfm.options import ClassicalOptions, RefinementOptions
+from stages.init.sfm.reconstruct import group_lenses
 from stages.init.sfm.refine import refine_solution, with_zoomed
 from stages.init.sfm.solver import Solver, known_focal, unknown_focal
 from tests.stages.init_scene import FOCAL, HEIGHT, WIDTH, make_scene, orbit, worst_rotation
@@ -160,6 +162,39 @@ def test_a_focal_length_that_exif_decides_stays_in_the_last_adjustment(tmp_path)
     best = known_focal(solver, True, lambda *_: None)
     found = refine_solution(solver, best, True, RefinementOptions())
     assert found.focals[0] == pytest.approx(FOCAL, rel=0.01)
+    assert worst_rotation(found, poses) < 0.3
+
+
+def test_a_photograph_on_its_side_has_the_lens_of_the_others(tmp_path):
+    scene, poses = make_scene([-20, 0, 20])
+    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # anticlockwise
+    poses[2] = np.block([[quarter @ poses[2][:3]], [np.eye(4)[3:]]])
+    shapes = [(HEIGHT, WIDTH), (HEIGHT, WIDTH), (WIDTH, HEIGHT)]
+
+    def held(view, pixels):
+        return pixels[:, ::-1] * (1, -1) + (0, WIDTH) if view == 2 else pixels
+
+    features = [
+        Features(
+            held(view, pixels), np.zeros((len(pixels), 128), np.float32), np.ones(len(pixels)),
+            np.ones(len(pixels)), np.arange(len(pixels)),
+        )
+        for view, pixels in enumerate(scene.positions)
+    ]  # fmt: skip
+    matches = {
+        (i, j): replace(
+            those, positions_i=held(i, those.positions_i), positions_j=held(j, those.positions_j),
+            roll_j=-90.0 if j == 2 else 0.0,
+        )
+        for (i, j), those in scene.correspondences.items()
+    }  # fmt: skip
+    lenses, of_view = group_lenses(shapes, [None] * 3)
+    assert (lenses, of_view) == ([Lens(WIDTH, WIDTH)], [0, 0, 0])
+    given = MappingInput.of(lenses, of_view, features, matches, shapes)
+    solver = Solver(given, ClassicalOptions(), 1.0, 0, 1, tmp_path)
+    found, determined = unknown_focal(solver, True, lambda *_: None)
+    assert determined
+    assert found.focals[2] == found.focals[0] == pytest.approx(FOCAL, rel=0.02)
     assert worst_rotation(found, poses) < 0.3
 
 

@@ -121,8 +121,8 @@ def test_views_of_one_size_and_focal_share_a_lens():
     lenses, of_view = group_lenses(
         [(384, 512), (384, 512), (512, 384), (256, 512)], [600.0, None, 600.0, None]
     )
-    assert of_view == [0, 0, 1, 2]
-    assert [lens.focal for lens in lenses] == [600, 600, 600]
+    assert of_view == [0, 0, 0, 1]
+    assert lenses == [Lens(512, 512, 600.0), Lens(512, 256, 600.0)]
     unknown, of_view = group_lenses([(384, 512), (384, 512)], [None, None])
     assert of_view == [0, 0]
     assert unknown[0].focal is None
@@ -133,7 +133,7 @@ def test_rounding_by_a_pixel_makes_no_other_lens():
         [(341, 512), (342, 512), (342, 512), (343, 512)], [600.0, 600.1, 606.0, 600.0]
     )
     assert of_view == [0, 0, 1, 2]
-    assert lenses[0] == Lens(512, 341, 600.0)
+    assert lenses[0] == Lens(512, 342, 600.0)
     _, of_view = group_lenses([(341, 512), (342, 512), (341, 512)], [None] * 3)
     assert of_view == [0, 0, 0]
 

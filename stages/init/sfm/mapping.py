@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,6 @@ class Solution:
         observed_pixel: [O, 2] pixels.
         residuals: [O] reprojection error in pixels of the photograph.
         edges: the pairs of views that it was made from.
-        principal_points: view index -> pixels, the middle of its lens's image.
     """
 
     poses: dict[int, Array]
@@ -53,7 +52,6 @@ class Solution:
     residuals: Array
     edges: tuple[Pair, ...] = ()
     distortions: dict[int, float] = field(default_factory=dict)
-    principal_points: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
@@ -94,7 +92,7 @@ class MappingInput:
     Attributes:
         lenses: the distinct cameras.
         lens_of_view: [N] for each view its lens.
-        positions: for each view [K, 2] keypoints in pixels.
+        positions: for each view [K, 2] keypoints in pixels of its lens.
         points: for each view [K] the keypoint that stands for each keypoint's place.
         correspondences: the matches of each pair.
     """
@@ -108,12 +106,27 @@ class MappingInput:
     @classmethod
     def of(
         cls, lenses: list[Lens], lens_of_view: list[int], features: Sequence[Features],
-        found: Mapping[Pair, Correspondences],
+        found: Mapping[Pair, Correspondences], shapes: Sequence[tuple[int, ...]],
     ) -> MappingInput:  # fmt: skip
-        """Views with these features, and the matches found between them."""
+        """Views of these shapes (rows, columns) with these features, and the matches between them.
+
+        The middle of each is moved to that of its lens.
+        """
+        shifts = [
+            np.array([lenses[lens].width - shape[1], lenses[lens].height - shape[0]]) / 2
+            for lens, shape in zip(lens_of_view, shapes, strict=True)
+        ]
+        moved = {
+            (i, j): replace(
+                those, positions_i=those.positions_i + shifts[i],
+                positions_j=those.positions_j + shifts[j],
+            )
+            for (i, j), those in sorted(found.items())
+        }  # fmt: skip
         return cls(
-            lenses, lens_of_view, [feature.positions for feature in features],
-            [feature.points for feature in features], dict(sorted(found.items())),
+            lenses, lens_of_view,
+            [feature.positions + shift for feature, shift in zip(features, shifts, strict=True)],
+            [feature.points for feature in features], moved,
         )  # fmt: skip
 
 
@@ -262,5 +275,4 @@ def solution_of(model: Any, edges: tuple[Pair, ...]) -> Solution:
         residuals=residuals,
         edges=edges,
         distortions=distortions,
-        principal_points={view: (lens.width / 2, lens.height / 2) for view, lens in lenses.items()},
     )

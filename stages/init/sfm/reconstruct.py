@@ -143,11 +143,14 @@ def reconstruct(
     """
     side = max(max(gray.shape) for gray in grays)
     pixel = side / REFERENCE_SIDE
-    lenses, lens_of_view = group_lenses([gray.shape for gray in grays], focals)
+    shapes = [gray.shape for gray in grays]
+    lenses, lens_of_view = group_lenses(shapes, focals)
 
-    def matched(rolls: list[float]) -> tuple[list[Features], Solver]:
+    def matched(
+        rolls: list[float],
+    ) -> tuple[list[Features], dict[Pair, Correspondences], Solver]:
         def solver_of(correspondences: dict[Pair, Correspondences]) -> Solver:
-            given = MappingInput.of(lenses, lens_of_view, features, correspondences)
+            given = MappingInput.of(lenses, lens_of_view, features, correspondences, shapes)
             return Solver(given, options, pixel, seed, threads, scratch)
 
         plain = tuple(squeeze for squeeze in options.squeezes if squeeze == 1) or options.squeezes
@@ -161,7 +164,7 @@ def reconstruct(
         lacking = weakly_linked(solver.links(), len(grays))
         far = [pair for pair in counts if pair not in found and lacking & {*pair}]
         if not far:
-            return features, solver
+            return features, found, solver
         copies = tuple(squeeze for squeeze in options.squeezes if squeeze not in plain)
         turned = sorted({view for pair in far for view in pair}) if copies else []
         small = [reduced(grays[view], valid[view], COPIES_SIDE) for view in turned]
@@ -175,9 +178,9 @@ def reconstruct(
             others = others.enlarged((width / gray.shape[1], height / gray.shape[0]))
             features[view] = joined(features[view], others)
         found |= match_pairs(features, far, options, pixel, threads, progress)
-        return features, solver_of(found)
+        return features, dict(sorted(found.items())), solver_of(found)
 
-    features, solver = matched([0.0] * len(grays))
+    features, correspondences, solver = matched([0.0] * len(grays))
     linked = solver.links()
     if refinement.unroll and len(set(groups(linked, len(grays)))) > 1:
         small = [reduced(*pair, COPIES_SIDE) for pair in zip(grays, valid, strict=True)]
@@ -187,8 +190,7 @@ def reconstruct(
             threads, progress,
         )  # fmt: skip
         if any(rolls):
-            features, solver = matched(rolls)
-    correspondences = solver.given.correspondences
+            features, correspondences, solver = matched(rolls)
     evidence = Evidence(
         keypoints=[len(np.unique(feature.points)) for feature in features],
         matches={pair: len(found) for pair, found in correspondences.items()},
@@ -245,30 +247,37 @@ def group_lenses(
 ) -> tuple[list[Lens], list[int]]:
     """Share one lens among views of one size and one known focal length.
 
-    What scaling has rounded is the same: of 6000 x 4000 and 1024 x 683 pixels come 341 and 342 rows
-    at 512 columns. A view without a known focal length, where other views have one, is taken to
-    have their median over the long side.
+    Photographs upright and on their sides are of one size, and so is what scaling has rounded: of
+    6000 x 4000 and 1024 x 683 pixels come 341 and 342 rows at 512 columns. The lens is as wide and
+    as high as all of its views, which lie in its middle. A view without a known focal length, where
+    other views have one, is taken to have their median over the long side.
     """
     sizes = [(shape[1], shape[0]) for shape in shapes]
     known = [focal / max(size) for focal, size in zip(focals, sizes, strict=True) if focal]
     usual = float(np.median(known)) if known else None
     lenses: list[Lens] = []
+    firsts: list[Lens] = []  # of each lens, as its first view has it
     lens_of_view = []
     for (width, height), focal in zip(sizes, focals, strict=True):
         if not focal and usual:
             focal = usual * max(width, height)
         lens = Lens(width, height, round(focal, 1) if focal else None)
-        same = (number for number, other in enumerate(lenses) if _is_one(lens, other))
-        number = next(same, len(lenses))
+        number = next((k for k, first in enumerate(firsts) if _is_one(lens, first)), len(lenses))
         if number == len(lenses):
             lenses.append(lens)
+            firsts.append(lens)
+        other = lenses[number]
+        lenses[number] = replace(
+            other, width=max(width, other.width), height=max(height, other.height)
+        )
         lens_of_view.append(number)
     return lenses, lens_of_view
 
 
 def _is_one(lens: Lens, other: Lens) -> bool:
-    """Are two lenses, both with a focal length or both without, one but for rounding?"""
-    apart = max(abs(lens.width - other.width), abs(lens.height - other.height))
+    """Are two lenses, both with a focal length or both without, one but for how they are held?"""
+    sides = sorted((lens.width, lens.height)), sorted((other.width, other.height))
+    apart = max(abs(a - b) for a, b in zip(*sides, strict=True))
     return apart <= 1 and abs((lens.focal or 1.0) / (other.focal or 1.0) - 1) < SAME_LENS
 
 

@@ -56,8 +56,9 @@ def sound(
     """
     small = [reduced(*pair, REFERENCE_SIDE) for pair in zip(grays, valid, strict=True)]
     scales = [few.shape[1] / gray.shape[1] for (few, _), gray in zip(small, grays, strict=True)]
+    shapes = [gray.shape for gray, _ in small]
     lenses, lens_of_view = group_lenses(
-        [gray.shape for gray, _ in small],
+        shapes,
         [focal and focal * scale for focal, scale in zip(focals, scales, strict=True)],
     )
     options = replace(
@@ -70,7 +71,7 @@ def sound(
     )  # fmt: skip
     pairs = [*overlaps(features, ordered, options)]
     found = match_pairs(features, pairs, options, pixel, threads, lambda *_: None)
-    given = MappingInput.of(lenses, lens_of_view, features, found)
+    given = MappingInput.of(lenses, lens_of_view, features, found, shapes)
     links = Solver(given, options, pixel, seed, threads, scratch).links()
     whole = all(few is gray for (few, _), gray in zip(small, grays, strict=True))
     linked = max(Counter(groups(links, len(grays))).values())
