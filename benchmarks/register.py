@@ -80,6 +80,7 @@ class Errors:
         parts, half: [T, 6] error of each part, and half of its stated 95 % interval.
         deviation: [T, 6] that the interval was made from.
         certain: [T] whether it is said to have moved.
+        basis: [T] what the interval stands on, a key of `comparing.FACTORS`.
     """
 
     moved: npt.NDArray[np.bool_]
@@ -89,6 +90,11 @@ class Errors:
     half: Array
     deviation: Array
     certain: npt.NDArray[np.bool_]
+    basis: npt.NDArray[np.str_]
+
+    def of(self, which: npt.NDArray[np.bool_]) -> Errors:
+        """Some of the teeth."""
+        return Errors(*(getattr(self, k)[which] for k in Errors.__annotations__))
 
     def covered(self, half: Array) -> npt.NDArray[np.bool_]:
         """[T] whether shift and turn are both off by no more than intervals [T, 6] say."""
@@ -161,7 +167,7 @@ def errors_of(found: Comparison, truth: dict[str, Any]) -> Errors:
     return Errors(
         np.array(moved), np.linalg.norm(parts[:, :3], axis=1),
         np.linalg.norm(parts[:, 3:], axis=1), parts, np.array(half),
-        np.array(deviation), np.array(certain),
+        np.array(deviation), np.array(certain), np.array([tooth.basis for tooth in found.teeth]),
     )  # fmt: skip
 
 
@@ -293,8 +299,17 @@ def calibrated(errors: Errors) -> tuple[tuple[float, float], tuple[float, float,
 def calibrate(found: dict[int, Errors]) -> None:
     """Say what the mouths ask for, and how mouths fare with what others ask for.
 
-    Each is judged by all the others, and each half of them by the other half.
+    Each is judged by all the others, and each half of them by the other half; what intervals stand
+    on, each for itself.
     """
+    for basis in comparing.FACTORS:
+        some = {s: e.of(e.basis == basis) for s, e in found.items() if (e.basis == basis).any()}
+        if some:
+            print(f"by {basis}:")
+            _calibrate(some)
+
+
+def _calibrate(found: dict[int, Errors]) -> None:
     factors, floors = calibrated(together(list(found.values())))
     print(f"calibrated on all: factors {np.round(factors, 2)}, floors {floors} (mm, degrees)")
     seeds = sorted(found)

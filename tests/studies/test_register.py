@@ -112,6 +112,39 @@ def test_pictures_that_do_not_fit_widen_the_interval(
         assert tooth.deviation == pytest.approx(wider * before), number
 
 
+def test_with_many_photographs_marks_that_both_ways_tell_make_surer(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there, back = (
+        replace(w, told=frozenset(t)) for w, t in zip(ways, ((11, 23), (23, 24)), strict=True)
+    )
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: (there, back))
+    monkeypatch.setattr(comparing, "MANY", len(found.first.looks))
+    assert {tooth.basis for tooth in found.teeth} == {"few"}
+    for tooth in compare_visits(found.first, found.second).teeth:
+        assert tooth.basis == ("marks" if tooth.tooth == 23 else "flow"), tooth.tooth
+        half = comparing.halves(
+            tooth.deviation, comparing.FACTORS[tooth.basis], comparing.FLOORS[tooth.basis]
+        )
+        assert tooth.half == pytest.approx(half)
+    assert comparing.FACTORS["marks"] < comparing.FACTORS["flow"]
+
+
+def test_with_many_photographs_a_tooth_that_one_way_alone_finds_is_not_measured(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of a generated mouth was off by 3 mm, and sure of it: nothing spoke against it."""
+    there, back = ways
+    lost = replace(back, blocks=tuple(b for b in back.blocks if b.tooth != 23))
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: (there, lost))
+    few = compare_visits(found.first, found.second)
+    assert 23 in {tooth.tooth for tooth in few.teeth}
+    monkeypatch.setattr(comparing, "MANY", len(found.first.looks))
+    many = compare_visits(found.first, found.second)
+    assert {t.tooth for t in many.teeth} == {t.tooth for t in few.teeth} - {23}
+    assert 23 in many.missing
+
+
 def test_what_certainly_moved_is_no_reference(
     found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,20 +20,21 @@ from pipeline.studies.register.visit import Visit, scale_of
 Array = npt.NDArray[np.float64]
 
 #: Half of a 95 % interval in standard deviations (of a shift's parts, of a turn's), with fewer than
-#: six photographs and with more; and what it never falls below: shifts (mm), tip and torque, and
-#: rotation (degrees). Chosen on generated mouths so that a tooth's shift and its turn are both
-#: covered in 95 % of the teeth, of those that moved alone as well, and so are 95 % of the parts:
-#: benchmarks/register.py --calibrate. With many photographs turns have a large factor: what does
-#: the same to all of them (shading, where marks are few) shows in none of the jackknives. Of three
-#: photographs, rotation is the least sure: crowns are round about their length, so that their shape
-#: does not tell it.
-FACTORS = {"few": (2.0, 1.4), "many": (2.0, 5.5)}
-FLOORS = {"few": (0.2, 4.0, 6.0), "many": (0.1, 0.5, 0.75)}
+#: six photographs, and with more by what a tooth is measured (`Moved.basis`); and what it never
+#: falls below: shifts (mm), tip and torque, and rotation (degrees). Chosen on generated mouths so
+#: that a tooth's shift and its turn are both covered in 95 % of the teeth, of those that moved
+#: alone as well, and so are 95 % of the parts: benchmarks/register.py --calibrate. What does the
+#: same to all photographs (shading, where marks are few) shows in none of the jackknives, nor does
+#: what a tooth that few of them show did along their lines of sight; both are mostly of teeth that
+#: flow measures. Of three photographs, rotation is the least sure: crowns are round about their
+#: length, so that their shape does not tell it.
+FACTORS = {"few": (2.0, 1.4), "marks": (3.1, 3.7), "flow": (6.1, 3.2)}
+FLOORS = {"few": (0.2, 4.0, 6.0), "marks": (0.02, 0.5, 0.75), "flow": (0.02, 4.0, 6.0)}
 MANY = 6
 #: Share of the jackknife over photographs that counts. Of few photographs mostly one or two show a
 #: tooth: without them the estimate falls back to no motion, so that the jackknife says how far the
 #: tooth went rather than how sure that is.
-BY_PHOTOGRAPH = {"few": 0.25, "many": 1.0}
+BY_PHOTOGRAPH = 0.25
 #: Visits are one patient's if crowns' surroundings correlate by this at least (see `likeness`).
 LEAST_LIKENESS = 0.8
 #: And if so many teeth, and such a share of them, agree with one frame.
@@ -60,6 +61,8 @@ class Moved:
         displacement: [6] shift (mm) and rotation vector (rad) there.
         spots: that it was measured by.
         photographs: of the second visit that show them.
+        basis: what its intervals stand on, a key of `FACTORS`: few photographs, or else the marks
+            of its enamel, both ways, or optical flow.
     """
 
     tooth: int
@@ -75,6 +78,7 @@ class Moved:
     displacement: Array
     spots: int
     photographs: int
+    basis: str
 
 
 @dataclass(frozen=True)
@@ -147,15 +151,15 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
             f"{LEAST_LIKENESS} is needed). Nothing was written. If they are of one patient, look "
             "at check.html of both workspaces: a wrong tooth number is the usual cause."
         )
-    factor = "many" if min(len(first.looks), len(second.looks)) >= MANY else "few"
-    teeth = _teeth(first, there, back, factor)
+    many = min(len(first.looks), len(second.looks)) >= MANY
+    teeth = _teeth(first, there, back, many)
     # What went no farther than most do by noise alone may still be sure to have moved.
     while moved := {t.tooth for t in teeth if t.certain} & {*there.still, *back.still}:
         there, back = (
             replace(way, still=tuple(n for n in way.still if n not in moved))
             for way in (there, back)
         )
-        teeth = _teeth(first, there, back, factor)
+        teeth = _teeth(first, there, back, many)
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
@@ -217,17 +221,21 @@ def _mirrored(
     return found
 
 
-def _teeth(first: Visit, there: Estimate, back: Estimate, factor: str) -> list[Moved]:
+def _teeth(first: Visit, there: Estimate, back: Estimate, many: bool) -> list[Moved]:
     """Both ways together: their mean; what they differ by adds to the doubt.
 
-    So do pictures that do not fit, where photographs are few.
+    So do pictures that do not fit, where photographs are few. Where they are many, a tooth that one
+    way alone finds is not measured: nothing would tell if that is wrong.
     """
     axes = tooth_axes(first.centres)
     result = []
-    forwards = measured(there, BY_PHOTOGRAPH[factor])
-    backwards = _mirrored(back, there, BY_PHOTOGRAPH[factor])
+    by_photograph = 1.0 if many else BY_PHOTOGRAPH
+    forwards = measured(there, by_photograph)
+    backwards = _mirrored(back, there, by_photograph)
     for number, (forward, covariance) in sorted(forwards.items()):
         displacement = forward
+        if many and number not in backwards:
+            continue
         if number in backwards:
             other, its = backwards[number]
             displacement = (forward + other) / 2
@@ -236,10 +244,13 @@ def _teeth(first: Visit, there: Estimate, back: Estimate, factor: str) -> list[M
         leads = to_parts(axes[number])
         parts = leads @ displacement
         deviation = np.sqrt(np.maximum(np.diag(leads @ covariance @ leads.T), 0))
-        if factor == "few":
+        if not many:
+            basis = "few"
             fits = [way.fits[number] for way in (there, back) if number in way.fits]
             deviation *= misfit(min(fits, default=RANGE[0]))
-        interval = halves(deviation, FACTORS[factor], FLOORS[factor])
+        else:
+            basis = "marks" if number in there.told & back.told else "flow"
+        interval = halves(deviation, FACTORS[basis], FLOORS[basis])
         mine = [s for s in there.spots if s.tooth == number and len(s.points)]
         turn = float(np.degrees(Rotation.from_rotvec(displacement[3:]).magnitude()))
         result.append(
@@ -252,6 +263,7 @@ def _teeth(first: Visit, there: Estimate, back: Estimate, factor: str) -> list[M
                     np.eye(4), displacement, there.centres[number]
                 ),
                 displacement, sum(len(s.points) for s in mine), len({s.second for s in mine}),
+                basis,
             )
         )  # fmt: skip
     return result

@@ -76,6 +76,7 @@ class Estimate:
         seen: FDI number -> [4, 4] motion of a tooth that moved, by which its few pictures fit
             better than by what flow says (see `photometric.judged`), where marks tell nothing.
         fits: FDI number -> correlation of the tooth's pictures by its motion, -1..1.
+        told: numbers of the teeth whose marks tell what they did.
     """
 
     state: State
@@ -89,6 +90,7 @@ class Estimate:
     first_from_second: Array
     seen: dict[int, Array] = field(default_factory=dict)
     fits: dict[int, float] = field(default_factory=dict)
+    told: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ def finished(found: Started) -> Estimate:
     residual = float(np.median([crown.residual for crown in laid.values()])) if laid else np.inf
     return Estimate(
         state, still, tuple(blocks), tuple(spots), laid, centres, likeness, residual,
-        found.first_from_second, seen, fits,
+        found.first_from_second, seen, fits, frozenset(told),
     )  # fmt: skip
 
 

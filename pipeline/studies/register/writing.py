@@ -31,6 +31,8 @@ NOTES = {
     "degrees",
     "half_interval": "half of the 95 % interval of each part, but for the scale, which is common "
     "to all lengths (scale_deviation_percent)",
+    "basis": "what the intervals stand on: few photographs; marks of the enamel; or, where these "
+    "are too faint, optical flow, whose turns are far less sure",
     "reference": "teeth that stood still, against which everything is measured: a movement that "
     "all teeth share can't be seen",
 }
@@ -78,6 +80,7 @@ def _tooth(tooth: Moved) -> dict[str, Any]:
         },
         "at": np.round(tooth.at, 3).tolist(),
         "motion": np.round(tooth.motion, 6).tolist(),
+        "basis": tooth.basis,
         "photographs": tooth.photographs,
         "spots": tooth.spots,
         "words": words(tooth.parts, tooth.half if tooth.certain else np.full(6, np.inf)),

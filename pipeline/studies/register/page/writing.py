@@ -41,6 +41,7 @@ def write_register_page(found: Comparison, out: Path, live: bool = True) -> Path
         tinted=tinted(found),
         warning=warning_of(found.first, found.second),
         said=[(t.tooth, words(t.parts, t.half)) for t in certain], farthest=FARTHEST,
+        faint=", ".join(str(t.tooth) for t in found.teeth if t.basis == "flow"),
         still=", ".join(map(str, found.still)), missing=", ".join(map(str, found.missing)),
     )  # fmt: skip
 
