@@ -25,7 +25,9 @@ def benchmark() -> ModuleType:
     return module
 
 
-def mouth(benchmark: ModuleType, seed: int, teeth: int, true: tuple[float, float]):  # type: ignore[no-untyped-def]
+def mouth(  # type: ignore[no-untyped-def]
+    benchmark: ModuleType, seed: int, teeth: int, true: tuple[float, float], basis: str = "marks"
+):
     """Errors of teeth that are off by `true` times what is stated as their deviation."""
     rng = np.random.default_rng(seed)
     deviation = np.exp(rng.normal(0, 0.5, (teeth, 6))) * np.repeat([0.3, 4.0], 3)
@@ -34,7 +36,7 @@ def mouth(benchmark: ModuleType, seed: int, teeth: int, true: tuple[float, float
     off[~moved] /= 5  # teeth that stood still look better than they are measured
     return benchmark.Errors(
         moved, np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1), off,
-        np.zeros((teeth, 6)), deviation, np.zeros(teeth, bool),
+        np.zeros((teeth, 6)), deviation, np.zeros(teeth, bool), np.full(teeth, basis),
     )  # fmt: skip
 
 
@@ -70,3 +72,16 @@ def test_a_mouth_is_judged_by_the_others(
     covered, teeth = map(int, alone.split("covered ")[1].split()[0].split("/"))
     assert teeth == 80
     assert 55 <= covered < 70
+
+
+def test_what_measures_a_tooth_has_factors_of_its_own(
+    benchmark: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    marks = mouth(benchmark, 1, 600, (1.0, 1.0))
+    flow = mouth(benchmark, 2, 600, (3.0, 3.0), "flow")
+    benchmark.calibrate({1: benchmark.together([marks, flow])})
+    lines = [line for line in capsys.readouterr().out.splitlines() if "left out" not in line]
+    assert [line for line in lines if line.startswith("by ")] == ["by marks:", "by flow:"]
+    for said, kind in zip(lines[1::2], (marks, flow), strict=True):
+        factors, _ = benchmark.calibrated(kind)
+        assert f"factors {np.round(factors, 2)}" in said
