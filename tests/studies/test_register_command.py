@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,7 @@ def test_the_command_writes_table_page_and_mesh(written: tuple[Path, Result]) ->
     assert said["scale_deviation_percent"] is None and said["first_scaled_by"] == 1
     page = (out / "register.html").read_text()
     assert "how far these may be off is not known" in page and ">unknown<" in page
+    assert not re.search(r"-0\.0+ ±", page) and "0.00 ±" in page
     assert page.count("data:image/jpeg") == 9
     for text in ("photograph 000 · right 000.jpg; arrows", "from the same place (000 · right 0"):
         assert text in page, text

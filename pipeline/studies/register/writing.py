@@ -102,7 +102,7 @@ def table(found: Comparison) -> str:
             "yes" if tooth.still else "no", f"{tooth.distance[0]:.3f}", f"{tooth.angle[0]:.2f}",
         ]  # fmt: skip
         for value, half in zip(tooth.parts, tooth.half, strict=True):
-            row += [f"{value:.3f}", f"{half:.3f}"]
+            row += [f"{value:z.3f}", f"{half:.3f}"]
         writer.writerow([*row, tooth.photographs, tooth.spots])
     return out.getvalue()
 

@@ -66,7 +66,7 @@ def _row(tooth: Moved) -> list[Cell]:
 
 
 def _measure(value: float, half: float, digits: int, sign: str, best: bool) -> Cell:
-    return Cell(f"{value:{sign}.{digits}f} ± {half:.{digits}f}", value, best)
+    return Cell(f"{value:{sign}z.{digits}f} ± {half:.{digits}f}", value, best)
 
 
 def shown_cameras(visit: Visit) -> list[tuple[str, Camera]]:
