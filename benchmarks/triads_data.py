@@ -15,12 +15,13 @@ SLOTS = ("0_right", "1_frontal", "2_left")
 OPEN = ("right_open", "front_open", "left_open")
 #: Photographs of a series that belong in a scene; of the fronts one is enough.
 SIDES, FRONTS = frozenset({"0_right", "2_left"}), frozenset({"1_frontal", "front_b"})
-#: Sorts of items. Those in `SORTS` are mixes.
+#: Sorts of items. Those in `SORTS` are mixes of three photographs, those in `FOURS` of four.
 CASE, SERIES = "case", "series"
 ALIEN, TWO, MIRRORED_SIDE, MIRRORED_FRONT, SWAPPED, APART = SORTS = (
     "one of another patient", "sides of another patient", "one side mirrored", "frontal mirrored",
     "sides swapped", "jaws apart",
 )  # fmt: skip
+BESIDE, HALVES = FOURS = "another patient's beside three", "two of each of two patients"
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Item:
 
     Attributes:
         name: unique.
-        sort: `CASE`, `SERIES` or one of `SORTS`.
+        sort: `CASE`, `SERIES` or one of `SORTS` and `FOURS`.
         photos: in the order in which they are given.
     """
 
@@ -184,6 +185,30 @@ def make_mixes(cases: list[Item], series: list[Item], count: int, seed: int = 0)
     mixes: list[Item] = []
     while len(mixes) < count and any(queues):
         mixes += [queue.pop() for queue in queues if queue]
+    return mixes[:count]
+
+
+def make_fours(cases: list[Item], count: int, seed: int = 0) -> list[Item]:
+    """At most `count` mixes of four, of either sort in turn; fewer are the beginning of more.
+
+    Of the first sort the three that belong together may become a scene, without the fourth.
+    """
+    rng = np.random.default_rng(seed)
+    ring = [cases[k] for k in rng.permutation(len(cases))]
+    mixes: list[Item] = []
+    for step in range(1, len(ring)):
+        for k, case in enumerate(ring):
+            other = ring[(k + step) % len(ring)]
+            more = replace(other.photos[(k + step) % 3], shown="3")
+            name = f"{case.name} and {other.name}/{more.path.stem}"
+            mixes.append(Item(f"{name} ({BESIDE})", BESIDE, (*case.photos, more)))
+            own, others = (
+                tuple(photo for slot, photo in enumerate(one.photos) if slot != (k + skipped) % 3)
+                for one, skipped in ((case, 0), (other, step))
+            )
+            named = tuple(replace(p, shown=f"{n}") for n, p in enumerate(others, 3))
+            name = " and ".join(f"{p.patient}/{p.path.stem}" for p in (*own, *others))
+            mixes.append(Item(f"{name} ({HALVES})", HALVES, (*own, *named)))
     return mixes[:count]
 
 

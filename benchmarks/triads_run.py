@@ -30,6 +30,7 @@ from pipeline.stage import LocalContext, get_stage
 from stages.teeth.read import Reading
 
 if TYPE_CHECKING:
+    from stages.init.dental.reconstruct import PlacedTeeth, Reconstruction
     from stages.init.dental.solution import ArchFit
     from stages.views.load import Loaded
 
@@ -98,6 +99,7 @@ class Runner:
         self._code = _digest_of_reader()
         self._reading_seconds = 0.0
         self._fits: list[ArchFit] = []
+        self._placed: ArchFit | None = None
         self._photos: dict[tuple[Path, int], Loaded] = {}
 
     def views_of(self, item: Item) -> tuple[Views, float]:
@@ -161,6 +163,7 @@ class Runner:
             seconds={**outcome.seconds, "teeth": seconds + self._reading_seconds},
         )  # fmt: skip
         self._fits.clear()
+        self._placed = None
         started = time.perf_counter()
         inputs = {"views": views, "teeth": read}
         try:
@@ -181,7 +184,7 @@ class Runner:
                 warnings=(*outcome.warnings, *context.warnings),
             )  # fmt: skip
         return replace(
-            outcome, fit=self._fits[-1] if self._fits else None,
+            outcome, fit=self._placed or (self._fits[0] if self._fits else None),
             fitted=tuple(view.name for view in views.views),
             seconds={**outcome.seconds, "init": time.perf_counter() - started},
         )  # fmt: skip
@@ -203,11 +206,16 @@ class Runner:
         from stages.teeth import reader
 
         fit_arch: Callable[..., ArchFit] = vars(reconstruct)["fit_arch"]
+        with_surface = reconstruct.with_surface
         read_photograph: Callable[..., Reading] = vars(reader)["read_photograph"]
 
         def kept_fit(*args: Any, **kwargs: Any) -> ArchFit:
             self._fits.append(fit_arch(*args, **kwargs))
             return self._fits[-1]
+
+        def kept_placed(teeth: PlacedTeeth, *args: Any) -> Reconstruction:
+            self._placed = teeth.small.fit
+            return with_surface(teeth, *args)
 
         def kept_reading(
             image: Any, valid: Any, name: str, quarters: int = 0, **rest: Any
@@ -220,6 +228,7 @@ class Runner:
 
         with ExitStack() as stack:
             stack.enter_context(patch.object(reconstruct, "fit_arch", kept_fit))
+            stack.enter_context(patch.object(reconstruct, "with_surface", kept_placed))
             stack.enter_context(patch.object(reader, "read_photograph", kept_reading))
             yield
 

@@ -61,7 +61,7 @@ def apply_corrections(teeth: Teeth, views: Views, corrections: Corrections) -> T
     """
     if not corrections:
         return teeth
-    wanted = _by_view(views, corrections)
+    wanted = photographs_of(views, corrections)
     by_name = views.by_name()
     corrected = []
     for dentition in teeth.views:
@@ -84,8 +84,14 @@ def shows_less(name: str) -> str:
     return f"it shows the same as {name}, which is clearer"
 
 
-def _by_view(views: Views, corrections: Corrections) -> dict[str, tuple[str, PhotoCorrection]]:
-    """View name -> (what the user calls it, its corrections)."""
+def photographs_of(
+    views: Views, corrections: Corrections
+) -> dict[str, tuple[str, PhotoCorrection]]:
+    """View name -> (what the user calls it, its corrections).
+
+    Raises:
+        RequestError: a photograph that isn't there, is named twice, or is another picture.
+    """
     names = {view.name: view.name for view in views.views}
     # A stem that two photographs share names neither.
     stems = [view.source_name.rpartition(".")[0] for view in views.views]

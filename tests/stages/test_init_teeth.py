@@ -31,18 +31,21 @@ from tests.teeth_case import write
 
 
 def run(
-    tmp_path, monkeypatch, found, read=None, asked=None, said=None, length=None, over=(), **dental
-):
+    tmp_path, monkeypatch, found, read=None, asked=None, said=None, length=None, over=(),
+    wanted=(), **dental,
+):  # fmt: skip
     """The stage with the reconstruction as given (an exception is raised); what it was asked.
 
     Args:
         said: text of `teeth.yaml`.
         over: photographs that the reconstruction turns over.
+        wanted: photographs that it must not leave out.
     """
 
-    def reconstruct(views, names, dentitions, *args, **kwargs):
+    def reconstruct(views, names, dentitions, *args, kept, **kwargs):
         if asked is not None:
             asked.extend(dentitions)
+        assert list(kept) == list(wanted)
         if isinstance(found, Exception):
             raise found
         shown = [view.mirrored() if k in over else view for k, view in enumerate(views)]
@@ -261,6 +264,30 @@ def test_a_photograph_that_was_turned_over_is_named(tmp_path, monkeypatch):
     before = photographs().views[2].image
     image = context.result("views").views[2].image
     np.testing.assert_allclose(image, before[:, ::-1], atol=0.5 / 255)
+
+
+def test_a_photograph_without_which_the_others_agree_is_named_and_set_aside(tmp_path, monkeypatch):
+    found = found_teeth()
+    two = (*found.fit.views[:2], None)
+    found = replace(
+        found, dentitions=[*found.dentitions[:2], None], fit=replace(found.fit, views=two),
+        surface=replace(found.surface, views=(*found.surface.views[:2], None)),
+        left_out=(2,), reasons=("p2.jpg may show another patient", "another numbering is as good"),
+    )  # fmt: skip
+    context = run(tmp_path, monkeypatch, found)
+    assert len(context.result("cameras").cameras) == 2
+    assert [bool(seen.set_aside) for seen in context.result("teeth").views] == [False, False, True]
+    assert context.result("teeth").views[2].all_crowns
+    (warning,) = [text for text in context.warnings if "left out" in text]
+    assert warning.startswith(
+        "p2.jpg does not fit the others, which agree without it: left out. With it: p2.jpg may "
+        "show another patient. Another numbering is as good. If it is to be used"
+    )
+
+
+def test_a_photograph_that_a_person_wants_is_not_left_out(tmp_path, monkeypatch):
+    said = "photographs: {p1.jpg: {use: true}, p2.jpg: {kind: left}}"
+    run(tmp_path, monkeypatch, found_teeth(), said=said, wanted=(1,))
 
 
 def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):

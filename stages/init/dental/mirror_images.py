@@ -28,12 +28,16 @@ class Turned:
         views, dentitions: with mirror images turned back.
         fit: what was found with them.
         mirrored: which were turned back.
+        left_out: which take no part, for the others agree without them (`odd_ones`).
+        reasons: the doubts about a fit with those that were left out.
     """
 
     views: list[View]
     dentitions: list[Dentition | None]
     fit: ArchFit
     mirrored: tuple[int, ...] = ()
+    left_out: tuple[int, ...] = ()
+    reasons: tuple[str, ...] = ()
 
 
 def fit_turned(
@@ -52,7 +56,7 @@ def fit_turned(
     """
     first = fit(views, dentitions)
     good = []
-    asked = {k for k, dentition in enumerate(dentitions) if dentition and _is_said(dentition)}
+    asked = {k for k, dentition in enumerate(dentitions) if dentition and is_said(dentition)}
     for mirrored in turnings(first, names) if first.doubts else []:
         if asked & set(mirrored):
             continue
@@ -91,7 +95,7 @@ def turnings(fit: ArchFit, names: Sequence[str]) -> list[tuple[int, ...]]:
     return [tuple(sides)] if wrong and not right else []
 
 
-def _is_said(dentition: Dentition) -> bool:
+def is_said(dentition: Dentition) -> bool:
     """Has a person said how the photograph shows the patient's sides?"""
     numbered = any(map(number_is_said, dentition.all_crowns))
     return dentition.mirrored is not None or numbered

@@ -20,8 +20,13 @@ from pipeline.stage import StageContext
 from stages.dentition.corrections import LEFT_OUT, SIDES, says_side
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.read import set_aside_reasons, teeth_to_place_by, turned_as_said
-from stages.init.dental.reconstruct import Reconstruction, reconstruct_teeth
+from stages.init.dental.read import (
+    said_to_use,
+    set_aside_reasons,
+    teeth_to_place_by,
+    turned_as_said,
+)
+from stages.init.dental.reconstruct import Reconstruction, as_sentence, reconstruct_teeth
 from stages.init.dental.scale import scale_from_widths, width_doubts
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.mouth import mouth_frame
@@ -35,6 +40,8 @@ Map = npt.NDArray[np.float32]
 #: and the next one has sat down after ten.
 _SITTING = 600.0
 _DAY = 86400.0
+#: Why a photograph without which the others agree is set aside.
+MISFIT = "it does not fit the others, which agree without it"
 #: Where fewer take part and there is no scene, it is said why others do not.
 _COMPLETE = 3
 
@@ -57,7 +64,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
             list(views.views), names, dentitions, with_focals(views.views, config.focal),
             arch_options(context, views, dentitions), surface_options(config.dental),
             accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
-            progress=context.progress,
+            progress=context.progress, kept=said_to_use(context, views),
         )  # fmt: skip
     except ReconstructionError as doubtful:
         kept = doubtful.artifacts.get("teeth")
@@ -71,15 +78,18 @@ def from_teeth(context: StageContext, views: Views) -> None:
             ) from doubtful  # fmt: skip
         raise
     for doubt in (
-        *teeth.fit.doubts, *only_two(names, teeth), *in_another_light(names, teeth),
+        *left_out(names, teeth), *teeth.fit.doubts, *only_two(names, teeth),
+        *in_another_light(names, teeth),
         *turned_back(names, teeth), *misnamed(names, teeth),
         *numbered_otherwise(teeth, config.dental.min_margin),
         *of_several_days(taking_part(views, dentitions)),
     ):  # fmt: skip
         context.warn(doubt)
-    numbered = replace(
-        updated(read, [d for d in teeth.dentitions if d is not None]), pictures=teeth.labelled
-    )
+    misfits = [
+        replace(d, set_aside=MISFIT) for k in teeth.left_out if (d := dentitions[k]) is not None
+    ]
+    new = [*(d for d in teeth.dentitions if d is not None), *misfits]
+    numbered = replace(updated(read, new), pictures=teeth.labelled)
     _write(context, given, teeth, numbered)
 
 
@@ -118,6 +128,20 @@ def only_two(names: list[str], teeth: Reconstruction) -> list[str]:
         "the other side would show is missing or seen from the front only, and that one of the "
         "two is a mirror image, or of another patient, shows less surely than with three. Add the "
         "other side if there is one."
+    ]
+
+
+def left_out(names: list[str], teeth: Reconstruction) -> list[str]:
+    """What to say of photographs without which the others agree."""
+    if not teeth.left_out:
+        return []
+    odd = " and ".join(names[k] for k in teeth.left_out)
+    one = len(teeth.left_out) == 1
+    why = " ".join(as_sentence(doubt, names) for doubt in teeth.reasons)
+    return [
+        f"{odd} {'does' if one else 'do'} not fit the others, which agree without "
+        f"{'it' if one else 'them'}: left out. With {'it' if one else 'them'}: {why} If "
+        f"{'it is' if one else 'they are'} to be used all the same, say so on the page check.html."
     ]
 
 

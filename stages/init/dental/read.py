@@ -16,7 +16,7 @@ from pipeline.artifacts.teeth import UNREAD, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.stage import StageContext
-from stages.dentition.corrections import LEFT_OUT, apply_corrections
+from stages.dentition.corrections import LEFT_OUT, apply_corrections, photographs_of
 from stages.init.place import photo_name
 
 #: Photographs that are named one by one where one thing is said of several.
@@ -29,6 +29,19 @@ def turned_as_said(context: StageContext, views: Views) -> Views:
         return views
     said = {seen.name for seen in labelled_teeth(context, views).views if seen.mirrored}
     return replace(views, views=tuple(v.mirrored() if v.name in said else v for v in views.views))
+
+
+def said_to_use(context: StageContext, views: Views) -> list[int]:
+    """Which of the views a person wants to be used, whatever they show."""
+    if CORRECTIONS not in context.sources:
+        return []
+    said = read_corrections(context.sources[CORRECTIONS])
+    wanted = {
+        name
+        for name, (_, photo) in photographs_of(context.load("views"), said).items()
+        if photo.use
+    }
+    return [k for k, view in enumerate(views.views) if view.name in wanted]
 
 
 def without_left_out(context: StageContext, views: Views) -> Views:

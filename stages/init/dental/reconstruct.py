@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from stages.dentition.working import resized_dentition, working_scale, working_v
 from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.odd_ones import without_odd_ones
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
@@ -47,7 +48,7 @@ class Reconstruction:
         fit: cameras and named landmarks, in pixels of `views`.
         surface: dense depth of each placed view, and one cloud.
         turned: the surface from three sides, in colour and as it is shaped.
-        mirrored: which photographs were turned back.
+        mirrored, left_out, reasons: as of `Turned`.
     """
 
     views: list[View]
@@ -56,6 +57,8 @@ class Reconstruction:
     surface: ArchSurface
     turned: Picture
     mirrored: tuple[int, ...] = ()
+    left_out: tuple[int, ...] = ()
+    reasons: tuple[str, ...] = ()
 
     @property
     def labelled(self) -> dict[str, Picture]:
@@ -88,7 +91,7 @@ class PlacedTeeth:
 def reconstruct_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
-    accept_doubtful: bool, threads: int, progress: Progress,
+    accept_doubtful: bool, threads: int, progress: Progress, kept: Collection[int] = (),
 ) -> Reconstruction:  # fmt: skip
     """Say which tooth is which, place the cameras, and make the surface.
 
@@ -101,6 +104,7 @@ def reconstruct_teeth(
         dentitions: the crowns of each; None: it takes no part.
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
+        kept: photographs that are not left out, whatever they show.
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
@@ -108,7 +112,7 @@ def reconstruct_teeth(
     """
     teeth = place_teeth(
         views, names, dentitions, focals, arch, accept_doubtful=accept_doubtful, threads=threads,
-        progress=progress,
+        progress=progress, kept=kept,
     )  # fmt: skip
     return with_surface(teeth, surface, threads, progress)
 
@@ -117,6 +121,7 @@ def place_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, *, accept_doubtful: bool, threads: int,
     progress: Progress, cameras: list[Array] | None = None, scales: list[float] | None = None,
+    kept: Collection[int] = (),
 ) -> PlacedTeeth:  # fmt: skip
     """Say which tooth is which, and place the cameras; arguments as for `reconstruct_teeth`.
 
@@ -147,12 +152,15 @@ def place_teeth(
 
     if cameras is None:
         turned = fit_turned(small, read, names, placed_by)
+        if turned.fit.doubts and arch.order is None and not accept_doubtful:
+            turned = without_odd_ones(turned, placed_by, kept)
     else:
         turned = Turned(small, read, placed_by(small, read))
     views = [v.mirrored() if k in turned.mirrored else v for k, v in enumerate(views)]
     dentitions = [
         mirrored_dentition(d) if d and k in turned.mirrored else d for k, d in enumerate(dentitions)
     ]
+    dentitions = [None if k in turned.left_out else d for k, d in enumerate(dentitions)]
     turned, dentitions = with_whole_crowns(turned, dentitions)
     fit = turned.fit.enlarged([1 / scale for scale in scales])
     numbered = [
@@ -214,7 +222,8 @@ def with_surface(
         small.dentitions, small.fit, surface, threads, progress, teeth.full,
     )  # fmt: skip
     return Reconstruction(
-        teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), small.mirrored
+        teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), small.mirrored,
+        small.left_out, small.reasons,
     )  # fmt: skip
 
 
