@@ -82,7 +82,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
         *in_another_light(names, teeth),
         *turned_back(names, teeth), *misnamed(names, teeth),
         *numbered_otherwise(teeth, config.dental.min_margin),
-        *of_several_days(taking_part(views, dentitions)),
+        *of_several_days(taking_part(views, teeth.dentitions)),
     ):  # fmt: skip
         context.warn(doubt)
     misfits = [

@@ -270,9 +270,10 @@ def _view_doubts(
         unnamed = inner.count(NO_TOOTH) / max(len(inner), 1)
         figures[f"unnamed_{view}"] = unnamed
         if unnamed > options.max_unnamed:
+            count = inner.count(NO_TOOTH)
             doubts.append(
-                f"{inner.count(NO_TOOTH)} crowns of {photo} fit no tooth: crowns found "
-                f"badly, a mirrored photograph or another patient"
+                f"{count} crown{'s' * (count > 1)} of {photo} fit{'s' * (count == 1)} no tooth: "
+                "crowns found badly, a mirrored photograph or another patient"
             )
     return doubts
 
