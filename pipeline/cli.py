@@ -207,7 +207,9 @@ def settings_command(
     stage: Annotated[
         str | None,
         typer.Argument(
-            metavar="STAGE", autocompletion=completion.stage, help="Only those of this stage."
+            metavar="STAGE|SETTING",
+            autocompletion=completion.stage,
+            help="Only those of this stage, as fit, or this one, as fit.iterations.",
         ),
     ] = None,
     as_json: AsJson = False,

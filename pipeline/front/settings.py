@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pipeline.config import RunConfig, load_config, model_in
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import RequestError, did_you_mean, nearest, shown
 from pipeline.stage import usable_stages
 
 _SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
@@ -46,22 +46,32 @@ class Setting:
 
 
 def settings(stage: str | None = None) -> list[Setting]:
-    """List every setting, those of the run first, or those of one stage.
+    """List every setting, those of the run first, or some.
 
     Args:
-        stage: name of a stage, or ``run``.
+        stage: name of a stage, or ``run``; or the beginning of names, up to a dot or the end, as
+            ``init.dense`` or ``fit.iterations``.
 
     Raises:
-        RequestError: there is no such stage.
+        RequestError: there are none of this name.
     """
     models = config_models()
-    if stage is not None and stage not in models:
-        raise RequestError(
-            f"There are no settings of '{stage}'. There are those of {', '.join(models)}."
-            f"{nearest(stage, models)}"
+    known = [found for name, model in models.items() for found in model_settings(model, name)]
+    if stage is None:
+        return known
+    chosen = [found for found in known if f"{found.name}.".startswith(f"{stage}.")]
+    if chosen or stage in models:
+        return chosen
+    near = nearest(stage, models)
+    if not near:
+        section = stage.partition(".")[0]
+        names = [found.name for found in known]
+        near = did_you_mean(
+            stage, [name for name in names if name.startswith(f"{section}.")] or names
         )
-    chosen = models if stage is None else {stage: models[stage]}
-    return [found for name, model in chosen.items() for found in model_settings(model, name)]
+    raise RequestError(
+        f"There are no settings of {shown(stage)}. There are those of {', '.join(models)}.{near}"
+    )
 
 
 def config_models() -> dict[str, type[BaseModel]]:

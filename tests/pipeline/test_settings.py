@@ -67,6 +67,15 @@ def test_settings_of_one_stage() -> None:
         settings("algin")
 
 
+def test_one_setting_and_those_below_a_name() -> None:
+    assert [setting.name for setting in settings("fit.iterations")] == ["fit.iterations"]
+    dense = [setting.name for setting in settings("init.dense")]
+    assert len(dense) > 2 and all(name.startswith("init.dense.") for name in dense)
+    for wrong in ("fit.iteratons", "iterations", "fit.iteration"):
+        with pytest.raises(RequestError, match=r"no settings of.*Did you mean fit.iterations, "):
+            settings(wrong)
+
+
 def test_a_typo_names_the_nearest_five_and_not_ninety() -> None:
     with pytest.raises(RequestError) as caught:
         load_config(None, ["fit.iteratons=3"])
