@@ -18,6 +18,7 @@ from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, is_there, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.paths import home_told
 
 REQUEST = "request.json"
 
@@ -124,9 +125,8 @@ def make_request(
     given = [images] if isinstance(images, str | Path) else list(images)
     if "" in given:
         raise RequestError("The name of a photograph or folder is empty; this folder is '.'.")
-    if workspace is None:
-        workspace = default_workspace(given)
-    folder = Path(workspace)
+    given = [home_told(path) for path in given]
+    folder = default_workspace(given) if workspace is None else Path(home_told(workspace))
     images_named = bool(given)
     taken_over: tuple[str, ...] = ()
     left_out: list[str] = []
@@ -339,7 +339,7 @@ def clean(
     Raises:
         RequestError: there is no such workspace.
     """
-    folder = Path(workspace)
+    folder = Path(home_told(workspace))
     if not is_workspace(folder):
         raise RequestError(f"{folder} is not a workspace, so nothing in it was deleted.")
     store = Store(folder)

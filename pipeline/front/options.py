@@ -12,19 +12,20 @@ import typer
 from pipeline.errors import RequestError, nearest
 from pipeline.front import completion
 from pipeline.process.privacy import SHARES, Share
+from pipeline.untrusted.paths import home_told
 
 Word = TypeVar("Word", bound=str)
 
 
 def path(text: str) -> Path:
-    """A path, which is not empty: pathlib takes that for the current folder.
+    """A path, `~` replaced, which is not empty: pathlib takes that for the current folder.
 
     Raises:
         RequestError: it is, as where a variable of the shell is not set.
     """
     if not text:
         raise RequestError("A path that was given is empty. The current folder is called '.'.")
-    return Path(text)
+    return Path(home_told(text))
 
 
 Images = Annotated[

@@ -31,6 +31,12 @@ def user_path(text: str | Path, setting: str) -> Path:
     return Path(text).expanduser()
 
 
+def home_told(path: str | Path) -> str:
+    """A path with `~` and `~name` replaced, which a shell leaves as they are in quotes and after
+    ``--option=``; where there is no such user it stays as it is."""
+    return os.path.expanduser(path)  # noqa: PTH111 - Path.expanduser fails there
+
+
 def _trouble(text: str | Path) -> str | None:
     try:
         os.lstat(Path(text).expanduser())

@@ -221,7 +221,8 @@ def _expand(item: str | Path) -> list[Path]:
 
 
 def _expand_pattern(path: Path) -> list[Path]:
-    matches = [Path(match) for match in glob.glob(str(path), recursive=True)]  # noqa: PTH207
+    pattern = _begun_literally(path)
+    matches = [Path(match) for match in glob.glob(pattern, recursive=True)]  # noqa: PTH207
     usable = [m for m in matches if not m.is_dir() and (is_photograph(m) or is_video(m))]
     if not usable:
         what = (
@@ -236,6 +237,12 @@ def _expand_pattern(path: Path) -> list[Path]:
     for match in usable:
         _refuse_special(match, "Among the photographs,")
     return usable
+
+
+def _begun_literally(pattern: Path) -> str:
+    """A pattern whose first folders mean themselves, as far as there are such: ``p [1]/*.jpg``."""
+    there = next(parent for parent in pattern.parents if _stat(parent) is not None)
+    return str(Path(glob.escape(str(there)), pattern.relative_to(there)))
 
 
 def _refuse_special(path: Path, what: str) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import load_config, parse_override, presets, result_fields, yaml_value
 from pipeline.errors import RequestError
+from pipeline.front.options import path
 from pipeline.process.privacy import share_for
 from pipeline.workspace import make_request
 
@@ -196,3 +197,11 @@ def test_one_stage_or_setting_may_be_given_as_it_is(tmp_path: Path) -> None:
     assert make_request((), tmp_path, stages="").stages is None
     with pytest.raises(RequestError, match="share is nobody or group; this is 'all'"):
         share_for(tmp_path, "all")  # type: ignore[arg-type]
+
+
+def test_a_tilde_that_no_shell_has_replaced(toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(toys))
+    request = make_request(["~/images/*", "~nosuch/a"], "~/w")
+    assert request.images == (str(toys / "images" / "*"), str(Path.cwd() / "~nosuch" / "a"))
+    assert request.workspace == toys / "w"
+    assert path("~/w") == toys / "w"

@@ -100,6 +100,13 @@ def test_folder(tmp_path: Path) -> None:
     assert found["img2.jpeg"] == tmp_path / "img2.jpeg"
 
 
+@pytest.mark.parametrize("pattern", ["*.jpg", "p [[]1]/*.jpg", "p [1]/*.jpg", "p*/*.jpg", "**/*"])
+def test_folders_with_brackets_in_their_names(tmp_path: Path, pattern: str) -> None:
+    touch(tmp_path, "a [2]/p [1]/x.jpg", "a 2/p 1/y.jpg")
+    folder = tmp_path / "a [2]" / ("p [1]" if pattern == "*.jpg" else "")
+    assert list(find_images([folder / pattern])) == ["x.jpg"]
+
+
 def test_files_patterns_and_repeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, _ = touch(tmp_path, "b.png", "a.png", "notes.txt")
     assert list(find_images([a, b])) == ["a.png", "b.png"]
