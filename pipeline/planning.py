@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from pipeline import installed
@@ -100,7 +101,7 @@ def resolve_chain(
     for name in names:
         get_stage(name)
     if len(set(names)) < len(names):
-        raise RequestError(f"A stage is named twice in --stages {','.join(names)}.")
+        raise RequestError(f"A stage is named twice: {','.join(names)}.")
     if from_stage is not None:
         if from_stage not in names:
             raise RequestError(
@@ -295,7 +296,7 @@ def plan_stage(
         images: what the user gave.
 
     Raises:
-        RequestError: the photographs can't be found or read.
+        RequestError: the photographs can't be found or read, or none are named.
     """
     stage = get_stage(name)
     inputs = stage_inputs(stage, table)
@@ -305,6 +306,11 @@ def plan_stage(
     if waiting:
         state = "pending" if pointer else "missing"
         return PlannedStage(name, state, inputs, [f"depends on {' and '.join(waiting)}"])
+    if stage.uses_sources and not images:
+        raise RequestError(
+            f"No photographs are named, and {store.root} remembers none: no run was started there. "
+            f"Name them as well: pipeline run PHOTOGRAPHS -w {quote(str(store.root))}"
+        )
     request = {"images": list(images), "workspace": store.root}
     sources = stage.sources(config.sections[name], request)
     hashes = {label: _hash_source(label, path) for label, path in sources.items()}

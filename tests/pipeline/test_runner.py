@@ -353,6 +353,12 @@ def test_workspace_remembers_its_photographs(run: Any) -> None:
     assert run("read.keep=1", images=(), stages=["read", "scale"])["read"] == "ran"
 
 
+def test_a_mistyped_workspace_remembers_nothing(run: Any, toys: Path) -> None:
+    with pytest.raises(pipeline.RequestError, match="w remembers none: no run was started there"):
+        run(images=())
+    assert not (toys / "w").exists()
+
+
 def test_photographs_that_are_away_for_a_while_are_not_forgotten(run: Any, toys: Path) -> None:
     run()
     (toys / "images").rename(toys / "elsewhere")
