@@ -81,6 +81,11 @@ def load_config(
     for name in tree:
         if name not in run_fields | sections:
             raise _unknown_section(name, tree[name], run_fields, sections)
+    if "stages" not in tree:
+        raise RequestError(
+            f"The preset {preset} names no stages. Let it begin with 'extends: {DEFAULT_PRESET}', "
+            "which it then changes, or give it a list of them: 'stages: [views, init, ...]'."
+        )
     run = validate(RunConfig, {k: v for k, v in tree.items() if k in run_fields}, "")
     for name in run.stages:
         if name not in sections:
@@ -127,8 +132,9 @@ def _read_preset(preset: str | Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         raise RequestError(f"The preset {path} must be a mapping with a section per stage.")
     base = tree.pop("extends", None)
     stages = usable_stages()
-    tree |= {
-        n: _section(stages[n].Config, tree[n], path.parent) for n in tree.keys() & stages.keys()
+    tree |= {  # a section whose lines are all comments says nothing
+        n: {} if tree[n] is None else _section(stages[n].Config, tree[n], path.parent)
+        for n in tree.keys() & stages.keys()
     }
     if base is None:
         return tree
@@ -266,13 +272,29 @@ def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
             child = {}
         tree[name] = child = dict(child)
         tree = child
-    tree[last] = value
+    whole = isinstance(value, dict) and isinstance(tree.get(last), dict) and _is_section(dotted)
+    tree[last] = _merge(tree[last], value) if whole else value
+
+
+def _is_section(dotted: str) -> bool:
+    """Is it the name of a stage, or of a section in one, and not that of a setting?"""
+    name, *parts = dotted.split(".")
+    stage = usable_stages().get(name)
+    if stage is None or not parts:
+        return stage is not None
+    field = _field_at(stage.Config, parts)
+    return field is not None and model_in(field.annotation) is field.annotation
 
 
 def _unknown_section(
     name: str, value: Any, run_fields: set[str], sections: set[str]
 ) -> RequestError:
     """The error of a setting whose first part is no stage."""
+    if name.partition(".")[0] in {"run", *sections}:
+        return RequestError(
+            f"{shown(name)}: a preset has a section for each stage, as in 'fit: {{near: .1}}', "
+            "and settings of a run stand by themselves, as in 'seed: 3'."
+        )
     known = sorted(run_fields | sections)
     near = nearest(name, known)
     if not near:  # the stage left out, as in --set iterations=500

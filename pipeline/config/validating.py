@@ -120,8 +120,9 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
             f"{section}' lists all {len(names)} with their meaning."
         )
     about = _description(model, location)
+    given = error.get("input")
     return (
-        f"{dotted}={shown(error.get('input'))} is not allowed: {why}."
+        f"{dotted}={'null' if given is None else shown(given)} is not allowed: {why}."
         f"{f' It means: {about}' if about else ''}"
     )
 

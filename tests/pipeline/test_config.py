@@ -55,6 +55,38 @@ def test_presets_extend_each_other(toys: Path) -> None:
         load_config(toys / "b.yaml")
 
 
+@pytest.mark.parametrize("section", ["scale:", "scale: {}", "scale: {round: true}"])
+def test_what_a_preset_does_not_say_is_as_in_the_one_that_it_extends(
+    toys: Path, section: str
+) -> None:
+    (toys / "a.yaml").write_text("extends: toy.yaml\nscale: {factor: 4}\n")
+    (toys / "b.yaml").write_text(f"extends: a.yaml\n{section}\n")
+    assert load_config(toys / "b.yaml").sections["scale"].factor == 4  # type: ignore[attr-defined]
+
+
+def test_a_section_that_is_set_changes_what_it_names() -> None:
+    one_by_one = load_config("no_flow", ["fit.near=0.1", "init.dense.planes=50"])
+    assert load_config("no_flow", ["fit={near: 0.1}", "init={dense: {planes: 50}}"]) == one_by_one
+    assert load_config("no_flow", {"fit.near": 0.1, "init.dense": {"planes": 50}}) == one_by_one
+    widths = ["init.dental.tooth_widths={11: 8.6}", "init.dental.tooth_widths={21: 8.5}"]  # one setting
+    assert load_config(None, widths) == load_config(None, widths[1:])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("scale: {factor: 3}", "names no stages. Let it begin with 'extends"),
+        ("extends: toy.yaml\nscale.factor: 3", "has a section for each stage"),
+        ("extends: toy.yaml\nrun: {seed: 3}", "settings of a run stand by themselves"),
+        ("extends: toy.yaml\nthreads: null", "threads=null is not allowed"),
+    ],
+)
+def test_a_preset_of_another_shape_is_told_which(toys: Path, text: str, told: str) -> None:
+    (toys / "mine.yaml").write_text(text)
+    with pytest.raises(RequestError, match=told):
+        load_config(toys / "mine.yaml")
+
+
 def test_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(RequestError, match="Did you mean 'dentalsplat'"):
         load_config("dentalsplot")
