@@ -28,6 +28,17 @@ def path(text: str) -> Path:
     return Path(home_told(text))
 
 
+def named(parameter: typer.CallbackParam, text: str | None) -> str | None:
+    """The value of an option that names something.
+
+    Raises:
+        RequestError: it names nothing.
+    """
+    if text is not None and not text.strip(" ,"):
+        raise RequestError(f"{parameter.opts[-1]} names nothing. Leave it out, or name something.")
+    return text
+
+
 Images = Annotated[
     list[str] | None,
     typer.Argument(
@@ -46,6 +57,7 @@ Preset = Annotated[
         "-c",
         "--config",
         autocompletion=completion.preset,
+        callback=named,
         help="A preset's name, or a YAML file.",
     ),
 ]
@@ -62,6 +74,7 @@ Stages = Annotated[
     typer.Option(
         "--stages",
         autocompletion=completion.stages,
+        callback=named,
         help="Only these, in this order: init,sap,fit.",
     ),
 ]

@@ -92,6 +92,8 @@ def test_status_tells_why(toys: Path) -> None:
         (("run", "images", "-w", "", "-c", "toy.yaml"), 2, "A path that was given is empty"),
         (("clean", "-w", ""), 2, "A path that was given is empty"),
         (("run", "", "-w", "w", "-c", "toy.yaml"), 2, "photograph or folder is empty"),
+        ((*RUN, "--stages", ""), 2, "--stages names nothing"),
+        (("run", "images", "-w", "w", "-c", ""), 2, "--config names nothing"),
         (("frobnicate",), 2, "frobnicate"),
     ],
 )

@@ -68,8 +68,8 @@ def test_a_section_that_is_set_changes_what_it_names() -> None:
     one_by_one = load_config("no_flow", ["fit.near=0.1", "init.dense.planes=50"])
     assert load_config("no_flow", ["fit={near: 0.1}", "init={dense: {planes: 50}}"]) == one_by_one
     assert load_config("no_flow", {"fit.near": 0.1, "init.dense": {"planes": 50}}) == one_by_one
-    widths = ["init.dental.tooth_widths={11: 8.6}", "init.dental.tooth_widths={21: 8.5}"]  # one setting
-    assert load_config(None, widths) == load_config(None, widths[1:])
+    widths = [f"init.dental.tooth_widths={given}" for given in ("{11: 8.6}", "{21: 8.5}")]
+    assert load_config(None, widths) == load_config(None, widths[1:]), "that is one setting"
 
 
 @pytest.mark.parametrize(
