@@ -15,7 +15,7 @@ from pipeline.planning import plan_chain, resolve_chain
 from pipeline.stage import stage_names
 from pipeline.store import Store, partial_name
 from pipeline.store.cleaning import checkpoints
-from pipeline.store.places import is_folder, is_there, set_aside
+from pipeline.store.places import is_folder, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
 from pipeline.untrusted.paths import home_told
@@ -80,18 +80,39 @@ class Request:
 
 
 def is_workspace(folder: Path) -> bool:
-    """Has a run been started there, whatever has become of it?"""
-    return is_there(folder / REQUEST)
+    """Has a run been started there, whatever has become of it?
+
+    Raises:
+        RequestError: this user may not look into it.
+    """
+    path = folder / REQUEST
+    try:
+        path.lstat()
+        closed = os.access(path, os.F_OK) and not os.access(path, os.R_OK)
+    except PermissionError:
+        closed = True
+    except (OSError, ValueError):
+        return False
+    if closed:
+        raise RequestError(
+            f"{path} can't be read: permission denied. A workspace is its owner's alone, and its "
+            "group's where its owner has run it with --share group. Ask for that, or choose "
+            "another workspace."
+        )
+    return True
 
 
 def read_request(folder: Path) -> dict[str, Any]:
     """What a workspace was asked for last: images, preset, overrides, stages, from.
 
     Raises:
-        RequestError: it is no workspace, or what it was asked for is not known any more.
+        RequestError: it is no workspace, not for this user to read, or what it was asked for is not
+            known any more.
     """
+    found = None
     try:
-        found = read_record(folder / REQUEST, SavedRequest)
+        if is_workspace(folder):
+            found = read_record(folder / REQUEST, SavedRequest)
     except DamagedError as error:
         raise RequestError(
             f"{folder / REQUEST} is damaged ({error}): what this workspace was made from is not "
@@ -127,13 +148,14 @@ def make_request(
         raise RequestError("The name of a photograph or folder is empty; this folder is '.'.")
     given = [home_told(path) for path in given]
     folder = default_workspace(given) if workspace is None else Path(home_told(workspace))
+    begun = is_workspace(folder)
     images_named = bool(given)
     taken_over: tuple[str, ...] = ()
     left_out: list[str] = []
     overrides = [anchored(change) for change in each_override(overrides)]
     named_preset = anchored_preset(preset)
     if not given:
-        remembered = read_request(folder) if is_workspace(folder) else {}
+        remembered = read_request(folder) if begun else {}
         if as_before and named_preset is None and remembered:
             now = list(overrides)
             named = {change.partition("=")[0].strip() for change in now}

@@ -280,6 +280,36 @@ def test_a_workspace_that_can_t_be_written_to(closed: Path, run: Any) -> None:
         pipeline.run_report(closed)
 
 
+@pytest.mark.parametrize("what", ["folder", "file"])
+def test_the_workspace_of_somebody_else(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    run(QUIET)
+    before, access = Path.lstat, os.access
+
+    def lstat(path: Path) -> os.stat_result:
+        if what == "folder" and path.parent == toys / "w":
+            raise PermissionError(13, "Permission denied", str(path))
+        return before(path)
+
+    monkeypatch.setattr(Path, "lstat", lstat)
+    monkeypatch.setattr(
+        os, "access",
+        lambda path, mode: (Path(path).name != "request.json" or mode != os.R_OK)
+        and access(path, mode),
+    )  # fmt: skip
+    workspace = toys / "w"
+    for ask in (
+        run,
+        lambda: run(images=()),
+        lambda: pipeline.status(workspace=workspace),
+        lambda: pipeline.clean(workspace),
+        lambda: pipeline.run_report(workspace),
+    ):
+        with pytest.raises(pipeline.RequestError, match=r"can't be read: permission denied"):
+            ask()
+
+
 def test_files_that_may_not_be_read(run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By other means than permissions, which don't hold for root."""
     run(QUIET)
