@@ -71,7 +71,10 @@ app = typer.Typer(
 def root(
     context: typer.Context,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show the whole trace of an error.")
+        bool,
+        typer.Option(
+            "--debug", help="Show the whole trace of an error. May also stand after any command."
+        ),
     ] = False,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
@@ -112,9 +115,6 @@ def run_command(
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show the whole trace of an error.")
-    ] = False,
 ) -> None:
     """Reconstruct a scene from photographs; every stage's result is cached."""
     from pipeline.front.commands import run
@@ -312,9 +312,10 @@ def command_line() -> int:
     """Run the command line; every outcome has its exit status (docs/first_case.md)."""
     let_streams_show_all()
     completion.suit_shell()
-    debug = "--debug" in sys.argv
+    words = [word for word in sys.argv[1:] if word != "--debug"]
+    debug = len(words) < len(sys.argv) - 1
     try:
-        status = app(standalone_mode=False)
+        status = app(words, standalone_mode=False)
         sys.stdout.flush()  # an answer that finds no room is said now, not as the interpreter ends
     except PipelineError as error:
         status = signals.STATUS if signals.asked() else _fail(error, error.exit_status, debug)

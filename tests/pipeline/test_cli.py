@@ -111,6 +111,9 @@ def test_debug_shows_the_trace(toys: Path) -> None:
     done = call(toys, *RUN, "--set", "count.fail=bug", "--debug")
     assert done.returncode == 1
     assert "ZeroDivisionError" in done.stderr and "Traceback" in done.stderr
+    for words in (("--debug", "status"), ("status", "--debug")):
+        done = call(toys, *words, "-w", "nosuch")
+        assert "Traceback" in done.stderr and "nosuch is not a workspace" in done.stderr
 
 
 def test_unwritable_workspace_is_refused(toys: Path) -> None:
