@@ -89,6 +89,19 @@ Sharing = Annotated[
         help="Who else may read what is written.  [default: as the workspace is, first nobody]",
     ),
 ]  # fmt: skip
+
+
+def out_option(default: str) -> Any:
+    """The option that names the folder of results.
+
+    Args:
+        default: what it is where none is named, for the help.
+    """
+    return typer.Option(
+        "-o", "--out", parser=path, help=f"Folder of the results.  [default: {default}]"
+    )
+
+
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but errors.")]
 Verbose = Annotated[
     bool, typer.Option("-v", "--verbose", help="Say more: each step, keys, memory.")

@@ -21,6 +21,7 @@ from pipeline.front.options import (
     answer,
     one_of,
     only_workspace,
+    out_option,
     path,
     sharing,
 )
@@ -88,15 +89,7 @@ def compare_command(
 
 def benchmark_command(
     suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite's name, or a YAML file.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            parser=path,
-            help="Folder of the results.  [default: ./runs/benchmark_SUITE]",
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("./runs/benchmark_SUITE")] = None,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -145,12 +138,7 @@ def batch_command(
             "CSV file with the columns name, photographs, settings.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", parser=path, help="Folder of the results.  [default: ./runs/batch_CASES]"
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("./runs/batch_CASES")] = None,
     jobs: Annotated[
         int, typer.Option("--jobs", min=1, help="Cases at a time here; they share the cores.")
     ] = 1,
@@ -217,12 +205,7 @@ def batch_command(
 
 def dicom_command(
     workspace: Workspace = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", parser=path, help="Folder of the files.  [default: WORKSPACE/dicom]"
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("WORKSPACE/dicom")] = None,
     patient_id: Annotated[str | None, typer.Option("--patient-id", help="PatientID.")] = None,
     patient_name: Annotated[
         str | None, typer.Option("--patient-name", help="PatientName, as Family^Given.")
@@ -284,12 +267,7 @@ def register_command(
     second: Annotated[
         Path, typer.Argument(metavar="B", parser=path, help="Workspace of the second visit.")
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", parser=path, help="Folder of the results.  [default: B/register]"
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("B/register")] = None,
     live: Annotated[
         bool,
         typer.Option(
