@@ -22,7 +22,10 @@ class Failures:
         self._root = root
 
     def record(self, stage: str, key: str, message: str) -> None:
-        """Remember why a stage failed, for `status`. A full disk must not hide the first error."""
+        """Remember why a stage failed, for `status`. A full disk must not hide the first error, and
+        a workspace that has gone is not begun anew for this."""
+        if not self._root.is_dir():
+            return
         path = stage_folder(self._root, stage) / FAILURE
         try:
             if is_folder(path):

@@ -56,6 +56,11 @@ def file_in_the_way(error: BaseException, below: Path | None = None) -> RequestE
         os.path.abspath(below)  # noqa: PTH100
     ):
         return None
+    if error.errno == errno.ENOENT:
+        return RequestError(
+            f"{path} has gone while it was worked in: something else has moved or deleted it. Put "
+            "back what was moved, and run the same command again; what is there is used again."
+        )
     return RequestError(
         f"{path} can't be used ({reason_of(error)}). Mend its permissions, or move away what is in "
         "its place, and run the same command again; nothing that was computed is lost."

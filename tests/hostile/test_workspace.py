@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
-from toy import artifact_bytes
+from toy import Numbers, artifact_bytes
 
 import pipeline
 from pipeline.cli import app
@@ -338,6 +338,25 @@ def test_a_folder_that_vanishes_or_closes_ends_with_the_remedy(
         patch.setattr("toy.Numbers.save", lambda numbers, folder: closed(folder / "numbers.json"))
         with pytest.raises(pipeline.RequestError, match=r"can't be used \(Permission denied\)"):
             run(QUIET)
+    assert run(QUIET) == RAN | {"read": "cached"}
+
+
+def test_a_workspace_that_is_moved_while_it_is_worked_in(
+    run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = Numbers.save
+
+    def moved(numbers: Numbers, folder: Path) -> None:
+        (toys / "w").rename(toys / "moved")
+        save(numbers, folder)
+
+    run(QUIET, stages=["read"])
+    with monkeypatch.context() as patch:
+        patch.setattr("toy.Numbers.save", moved)
+        with pytest.raises(pipeline.RequestError, match=r"numbers.json has gone while"):
+            run(QUIET)
+    assert not (toys / "w").exists(), "nothing is left in its old place"
+    (toys / "moved").rename(toys / "w")
     assert run(QUIET) == RAN | {"read": "cached"}
 
 
