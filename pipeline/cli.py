@@ -17,6 +17,7 @@ from pipeline.front import completion
 from pipeline.front.options import (
     AsJson,
     Images,
+    OldWorkspace,
     Overrides,
     Preset,
     Quiet,
@@ -95,12 +96,15 @@ def run_command(
     overrides: Overrides = None,
     frames: Annotated[
         int | None,
-        typer.Option("--frames", help="Use so many, evenly chosen; default: all, 24 of a video."),
+        typer.Option(
+            "--frames", metavar="N", help="Use so many, evenly chosen; default: all, 24 of a video."
+        ),
     ] = None,
     from_stage: Annotated[
         str | None,
         typer.Option(
             "--from",
+            metavar="STAGE",
             autocompletion=completion.stage,
             help="Begin at this stage; take the rest as it is.",
         ),
@@ -147,7 +151,7 @@ def run_command(
 @app.command("status")
 def status_command(
     images: Images = None,
-    workspace: Workspace = None,
+    workspace: OldWorkspace = None,
     config: Preset = None,
     stages: Stages = None,
     overrides: Overrides = None,
@@ -174,7 +178,7 @@ def status_command(
 
 @app.command("report")
 def report_command(
-    workspace: Workspace = None,
+    workspace: OldWorkspace = None,
     anonymous: Annotated[
         bool,
         typer.Option(
@@ -267,7 +271,7 @@ register_studies(app)
 
 @app.command("clean")
 def clean_command(
-    workspace: Workspace = None,
+    workspace: OldWorkspace = None,
     keep: Annotated[
         int, typer.Option("--keep", min=0, help="Keep this many unused results of each stage.")
     ] = 0,

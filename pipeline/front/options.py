@@ -42,20 +42,31 @@ def named(parameter: typer.CallbackParam, text: str | None) -> str | None:
 Images = Annotated[
     list[str] | None,
     typer.Argument(
-        help="A folder, files, a quoted glob pattern, or one video.", show_default=False
+        metavar="IMAGES",
+        help="A folder, files, a quoted glob pattern, or one video.",
+        show_default=False,
     ),
 ]
 Workspace = Annotated[
     Path | None,
     typer.Option(
-        "-w", "--workspace", parser=path, help="Where results are kept.  [default: ./runs/<input>]"
+        "-w", "--workspace", metavar="FOLDER", parser=path,
+        help="Where results are kept.  [default: ./runs/NAME_OF_IMAGES]",
     ),
-]
+]  # fmt: skip
+OldWorkspace = Annotated[
+    Path | None,
+    typer.Option(
+        "-w", "--workspace", metavar="FOLDER", parser=path,
+        help="Where a run keeps its results.  [default: this folder, or the only one in ./runs]",
+    ),
+]  # fmt: skip
 Preset = Annotated[
     str | None,
     typer.Option(
         "-c",
         "--config",
+        metavar="PRESET|FILE",
         autocompletion=completion.preset,
         callback=named,
         help="A preset's name, or a YAML file.",
@@ -65,14 +76,16 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
+        metavar="STAGE.KEY=VALUE",
         autocompletion=completion.setting,
-        help="stage.key=value, as in fit.iterations=500. May be repeated.",
+        help="A setting, as in fit.iterations=500. May be repeated.",
     ),
 ]
 Stages = Annotated[
     str | None,
     typer.Option(
         "--stages",
+        metavar="STAGE,...",
         autocompletion=completion.stages,
         callback=named,
         help="Only these, in this order: init,sap,fit.",
@@ -98,8 +111,9 @@ def out_option(default: str) -> Any:
         default: what it is where none is named, for the help.
     """
     return typer.Option(
-        "-o", "--out", parser=path, help=f"Folder of the results.  [default: {default}]"
-    )
+        "-o", "--out", metavar="FOLDER", parser=path,
+        help=f"Folder of the results.  [default: {default}]",
+    )  # fmt: skip
 
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but errors.")]

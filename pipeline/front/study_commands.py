@@ -11,13 +11,13 @@ import typer
 
 from pipeline.front.options import (
     AsJson,
+    OldWorkspace,
     Overrides,
     Preset,
     Quiet,
     Sharing,
     Stages,
     Verbose,
-    Workspace,
     answer,
     one_of,
     only_workspace,
@@ -28,11 +28,14 @@ from pipeline.front.options import (
 
 
 def compare_command(
-    workspace: Workspace = None,
+    workspace: OldWorkspace = None,
     colmap: Annotated[
         Path | None,
         typer.Option(
-            "--colmap", parser=path, help="Folder of a COLMAP model of the same photographs."
+            "--colmap",
+            metavar="FOLDER",
+            parser=path,
+            help="Folder of a COLMAP model of the same photographs.",
         ),
     ] = None,
     run_colmap: Annotated[
@@ -42,6 +45,7 @@ def compare_command(
         Path | None,
         typer.Option(
             "--ground-truth",
+            metavar="FILE|FOLDER",
             parser=path,
             help="True cameras: transforms.json or a COLMAP model; default: what the run was "
             "evaluated with.",
@@ -51,6 +55,7 @@ def compare_command(
         Path | None,
         typer.Option(
             "--mesh",
+            metavar="FILE",
             parser=path,
             help="True surface, in the frame of --ground-truth; default: evaluate.mesh.",
         ),
@@ -93,7 +98,10 @@ def benchmark_command(
     data: Annotated[
         Path | None,
         typer.Option(
-            "--data", parser=path, help="Where the suite's data are, if not where it says."
+            "--data",
+            metavar="FOLDER",
+            parser=path,
+            help="Where the suite's data are, if not where it says.",
         ),
     ] = None,
     jobs: Annotated[
@@ -204,7 +212,7 @@ def batch_command(
 
 
 def dicom_command(
-    workspace: Workspace = None,
+    workspace: OldWorkspace = None,
     out: Annotated[Path | None, out_option("WORKSPACE/dicom")] = None,
     patient_id: Annotated[str | None, typer.Option("--patient-id", help="PatientID.")] = None,
     patient_name: Annotated[

@@ -37,6 +37,13 @@ def test_no_arguments_teaches_by_example(toys: Path) -> None:
     assert "--stages init,sap,fit" in done.stdout
 
 
+def test_help_says_which_workspace_is_meant_where_none_is_named(toys: Path) -> None:
+    assert "[default: ./runs/" in " ".join(call(toys, "run", "--help").stdout.split())
+    for command_that_makes_none in ("status", "report", "clean", "compare", "dicom"):
+        said = " ".join(call(toys, command_that_makes_none, "--help").stdout.split())
+        assert "[default: this folder, or the only one in ./runs]" in said
+
+
 def test_run_ends_with_a_summary(toys: Path) -> None:
     done = call(toys, *RUN)
     assert done.returncode == 0, done.stderr
