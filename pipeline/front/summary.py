@@ -110,7 +110,7 @@ def print_status(stages: list[StageStatus]) -> None:
         if stage.state == "cached" and why:
             why = f"last ran because: {why}"
         if stage.resumable:
-            why += "; goes on from its checkpoint"
+            why = "; ".join(filter(None, (why, "goes on from its checkpoint")))
         style = STATE_STYLE.get(stage.state, "")
         state = f"[{style}]{stage.state}[/]" if style else stage.state
         table.add_row(stage.name, state, escape(why), escape(describe(stage.summary)))

@@ -85,6 +85,12 @@ def test_status_tells_why(toys: Path) -> None:
     assert "depends on scale" in done.stdout
 
 
+def test_status_tells_of_a_checkpoint(toys: Path) -> None:
+    call(toys, *RUN, "--set", "count.fail=interrupt")
+    (line,) = (e for e in call(toys, "status", "-w", "w").stdout.splitlines() if "count " in e[:6])
+    assert line.split(maxsplit=2)[2].strip() == "goes on from its checkpoint"
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "text"),
     [
