@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
@@ -10,11 +11,14 @@ from filelock import Timeout
 from pipeline.store.failures import EVIDENCE, FAILURE
 from pipeline.store.locks import LOCK, lock_of
 from pipeline.store.places import ASIDE, is_folder, is_there, remove, size_of
+from pipeline.store.results import KEY_LENGTH
 
 #: Ends the name of the folder that a result is written into.
 PARTIAL = ".partial"
 #: What a killed run leaves to go on from.
 SCRATCH = "scratch"
+#: Names of folders of results, and of those that are written, replaced or set aside.
+_OWN = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\..*)?")
 
 
 def clean(
@@ -78,8 +82,14 @@ def holds_checkpoint(partial: Path) -> bool:
     return is_folder(scratch) and any(path.suffix != ".tmp" for path in scratch.iterdir())
 
 
+def _is_own(path: Path) -> bool:
+    """Is it the store's by its name, and nothing that a user has put there?"""
+    name = path.name
+    return ASIDE in name or (is_folder(path) and (name == EVIDENCE or bool(_OWN.fullmatch(name))))
+
+
 def _unused(folder: Path, keep: int, in_use: str | None, manifest: str) -> list[Path]:
-    entries = [path for path in folder.iterdir() if is_folder(path) or ASIDE in path.name]
+    entries = [path for path in folder.iterdir() if _is_own(path)]
     if is_there(folder / FAILURE):  # which names what is kept there
         entries = [path for path in entries if path.name != EVIDENCE]
     whole = [path for path in entries if (path / manifest).is_file() and "." not in path.name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -94,8 +95,11 @@ def test_clean_removes_leftovers_of_every_kind(tmp_path: Path) -> None:
         put(store, 2, key="b" * 64)
         (store.begin("fit", "c" * 64) / "scratch" / "checkpoint").write_text("half")
         (tmp_path / "fit" / ("d" * 12)).mkdir()  # a result that lost its manifest
+    for name in ("for the doctor", f"{'b' * 12}_copy"):
+        shutil.copytree(store.folder("fit", "b" * 64), tmp_path / "fit" / name)
     removed, _ = store.clean(keep=0)
     assert sorted(removed) == [f"fit/{'b' * 12}", f"fit/{'c' * 12}.partial", f"fit/{'d' * 12}"]
+    assert (tmp_path / "fit" / "for the doctor").is_dir(), "what a user puts there stays"
     assert value_of(store) == 1
 
 
