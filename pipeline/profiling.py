@@ -39,12 +39,12 @@ def profiled(page: Path) -> Iterator[None]:
     from pyinstrument import Profiler
     from pyinstrument.renderers import HTMLRenderer
 
+    page.parent.mkdir(exist_ok=True)  # what is in the way is found before the work is done
     profiler = Profiler(interval=INTERVAL, async_mode="disabled")
     profiler.start()
     try:
         yield
     finally:
         session = profiler.stop()
-        page.parent.mkdir(exist_ok=True)
         text = HTMLRenderer(show_all=True).render(session)
         page.write_text(_FONTS.sub("data:text/css,", text), encoding="utf-8")

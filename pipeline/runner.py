@@ -280,9 +280,10 @@ class Runner:
         with contextlib.suppress(OSError):  # the first error is the one to tell
             self.store.discard_outputs(name, key)
         if isinstance(failure, ReconstructionError):
-            folder = self.store.failures.keep(name, failure.pictures, failure.artifacts)
-            if failure.pictures:
-                failure.args = (f"{failure}{PICTURES}{folder}",)
+            with contextlib.suppress(OSError):
+                folder = self.store.failures.keep(name, failure.pictures, failure.artifacts)
+                if failure.pictures:
+                    failure.args = (f"{failure}{PICTURES}{folder}",)
         with contextlib.suppress(OSError):
             self.store.failures.record(name, key, str(failure))
         return failure

@@ -242,6 +242,17 @@ def test_pictures_of_a_failure_are_kept_until_a_run_succeeds(run: Any, toys: Pat
     assert not folder.exists()
 
 
+def test_pictures_that_find_no_room_do_not_hide_the_failure(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(pictures: Any, folder: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(folder))
+
+    monkeypatch.setattr("pipeline.artifacts.pictures.Pictures.save", full)
+    with pytest.raises(pipeline.ReconstructionError, match=r"add one between them\.$"):
+        run("count.fail=data")
+
+
 def test_figures_may_be_numpy_s(run: Any, toys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def count(self: Any, context: Any) -> None:
         context.save(context.load("numbers"))
