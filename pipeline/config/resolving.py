@@ -211,13 +211,14 @@ def anchored(change: str, begin: str | Path = "") -> str:
     name, _, text = change.partition("=")
     try:
         section, *parts = name.strip().split(".")
-        field = _field_at(get_stage(section).Config, parts)
+        model = get_stage(section).Config
         value = plain_yaml(text, "it")
     except RequestError:
         return change
     if type(value) in (int, float):  # a folder may be called 2024
         value = text.strip()
-    whole = _whole(field, value, begin)
+    field = _field_at(model, parts)
+    whole = _whole(field, value, begin) if parts else _section(model, value, begin)
     return change if whole == value else f"{name}={yaml_value(whole)}"
 
 

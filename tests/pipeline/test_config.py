@@ -189,6 +189,9 @@ def test_paths_hold_in_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert make_request("photos", "w", "paper", {"views.masks": "m"}).overrides == (
         f"views.masks={tmp_path}/m",
     )
+    assert make_request("photos", "w", None, {"views": {"masks": "m", "frames": 3}}).overrides == (
+        f"views={{frames: 3, masks: {tmp_path}/m}}",
+    )
 
 
 def test_the_place_of_a_file_is_not_in_the_key() -> None:
