@@ -361,7 +361,12 @@ def _unexpected(error: Exception, debug: bool) -> int:
         return _fail(RequestError(error.format_message()), 2, debug)
     from pipeline.store import file_in_the_way, is_disk_full
 
-    if is_disk_full(error, Path.cwd()):
+    try:
+        here = Path.cwd()
+    except OSError:
+        gone = 'The folder that this was called in is not there any more. Enter it anew: cd "$PWD"'
+        return _fail(RequestError(gone), 2, debug)
+    if is_disk_full(error, here):
         return _fail(
             RequestError("The disk is full. Make room and run the same command again."), 2, debug
         )

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import distributions
 from pathlib import Path
 
+from pipeline.config import DEFAULT_PRESET, presets, read_yaml
 from pipeline.errors import PipelineError
 from pipeline.installed import is_installed, library_version
 from pipeline.measure import usable_cores
@@ -180,6 +181,12 @@ def _stages() -> Iterator[Finding]:
     names = stage_names()
     if not names:
         yield Finding("stages", "problem", "none registered", "Install dentalsplat with pip.")
+    for name in read_yaml(presets()[DEFAULT_PRESET], "preset")["stages"]:
+        if names and name not in names:
+            yield Finding(
+                f"stage {name}", "problem", "not registered, and every run has it",
+                "Install dentalsplat again with pip: another version is registered here.",
+            )  # fmt: skip
     for name in names:
         try:
             stage = get_stage(name)

@@ -69,6 +69,14 @@ def test_no_stages_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any(finding.level == "problem" for finding in checkup._stages())
 
 
+def test_stages_of_another_version_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An editable installation registers those that there were when it was made."""
+    names = [name for name in checkup.stage_names() if name != "teeth"]
+    monkeypatch.setattr(checkup, "stage_names", lambda: names)
+    found = by_name(list(checkup._stages()))["stage teeth"]
+    assert found.level == "problem" and "Install dentalsplat again" in found.mend
+
+
 def test_every_stage_of_the_project_can_be_imported() -> None:
     findings = list(checkup._stages())
     assert findings[-1].name == "stages" and findings[-1].level == "ok"

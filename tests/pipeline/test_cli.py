@@ -120,6 +120,13 @@ def test_failure_is_one_paragraph_with_its_status(
     assert "Traceback" not in done.stderr
 
 
+def test_the_folder_it_is_called_in_has_gone(toys: Path) -> None:
+    call_there = f"cd {toys / 'images'} && rm -r ../images && {sys.executable} {TOY} run 1.txt"
+    done = subprocess.run(["sh", "-c", call_there], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "is not there any more" in done.stderr
+
+
 def test_debug_shows_the_trace(toys: Path) -> None:
     done = call(toys, *RUN, "--set", "count.fail=bug", "--debug")
     assert done.returncode == 1
