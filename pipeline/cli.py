@@ -358,7 +358,11 @@ def _fail(error: BaseException, status: int, debug: bool) -> int:
 
 def _unexpected(error: Exception, debug: bool) -> int:
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # click's usage errors
-        return _fail(RequestError(error.format_message()), 2, debug)
+        text = error.format_message()
+        if text.startswith("No such command"):
+            names = ", ".join(str(command.name) for command in app.registered_commands)
+            text += f" The commands are {names}. To make a scene: pipeline run PHOTOGRAPHS"
+        return _fail(RequestError(text), 2, debug)
     from pipeline.store import file_in_the_way, is_disk_full
 
     try:

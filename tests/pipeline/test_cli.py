@@ -108,6 +108,7 @@ def test_status_tells_of_a_checkpoint(toys: Path) -> None:
         ((*RUN, "--stages", ""), 2, "--stages names nothing"),
         (("run", "images", "-w", "w", "-c", ""), 2, "--config names nothing"),
         (("frobnicate",), 2, "frobnicate"),
+        (("images",), 2, "To make a scene: pipeline run PHOTOGRAPHS"),
     ],
 )
 def test_failure_is_one_paragraph_with_its_status(
