@@ -98,7 +98,7 @@ class Runner:
         def tell(kernel: str) -> None:
             if not told:
                 self.reporter.message(
-                    "Kernels are compiled for this processor, once: this run takes up to a minute "
+                    "Kernels are compiled for this processor, once: this run takes a minute or two "
                     "longer than the next."
                 )
             told.add(kernel)
