@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 import pytest
 import typer
 
+from pipeline.artifacts.dental.corrections import read_corrections
 from pipeline.cli import app
 from pipeline.config import load_config, presets
 from pipeline.front.settings import settings
+from pipeline.running.outcomes import RunSummary, StageOutcome
 from pipeline.stage import stage_names
 
 ROOT = Path(__file__).parents[1]
@@ -78,6 +81,26 @@ def test_examples_of_extending_run(tmp_path: Path) -> None:
         exec(compile(block, str(page), "exec"), names)
     names["Heights"]({"11": 9.5}).save(tmp_path)
     assert names["Heights"].load(tmp_path).by_tooth == {"11": 9.5}
+
+
+def test_what_formats_says_of_teeth_yaml_is_read(tmp_path: Path) -> None:
+    (text,) = blocks(ROOT / "docs" / "formats.md", "yaml")
+    path = tmp_path / "teeth.yaml"
+    path.write_text(text)
+    (photo,) = read_corrections(path).photographs.values()
+    assert [crown.tooth for crown in photo.crowns] == [16, None, None]
+    assert photo.crowns[1].remove and photo.crowns[2].split
+
+
+def test_the_answer_in_programs_is_what_a_run_gives() -> None:
+    page = ROOT / "docs" / "programs.md"
+    (shown,) = (json.loads(text) for text in blocks(page, "") if text.startswith("{"))
+    outcome = StageOutcome("teeth", "ran", folder=Path("folder"))
+    answer = RunSummary(Path("cases/anna"), [outcome]).to_dict()
+    assert shown.keys() == answer.keys()
+    assert shown["stages"][0].keys() == answer["stages"][0].keys()
+    names = {"wall_seconds", "cpu_seconds", "peak_memory_mb", "summary"}
+    assert shown["stages"][0]["figures"].keys() == names
 
 
 @pytest.mark.parametrize("page", sorted({*PAGES, *BESIDE}), ids=lambda page: page.name)
