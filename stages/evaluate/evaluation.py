@@ -113,8 +113,8 @@ def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Re
                 _warn_of_masks(context, figures)
     elif held:
         context.warn(
-            f"{len(held)} photographs are held out, but their cameras are not known: they are not "
-            "scored. Give --set evaluate.ground_truth=PATH with a transforms.json or COLMAP model."
+            f"Photographs held out are not scored ({len(held)}): their cameras are not known. Give "
+            "--set evaluate.ground_truth=PATH with a transforms.json or COLMAP model."
         )
     if config.novel_angle > 0:
         middle = np.median(gaussians.means.astype(np.float64), axis=0)

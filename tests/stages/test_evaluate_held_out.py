@@ -227,7 +227,7 @@ def test_the_geometry_of_the_exact_reconstruction(tmp_path: Path) -> None:
 def test_held_out_without_truth_is_said(tmp_path: Path) -> None:
     context = run(tmp_path / "out", case(tmp_path), flip=False, novel_angle=0)
     assert "held_out" not in context.result("metrics").figures
-    assert "2 photographs are held out" in context.warnings[0]
+    assert "held out are not scored (2)" in context.warnings[0]
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
