@@ -1,6 +1,6 @@
 """The triads as other cameras and other hands would have taken them: for `triads.py --data`.
 
-    python benchmarks/triads_altered.py --data DIR --out OUT [--seed 0] [--sorts light,turned,...]
+    python benchmarks/triads_altered.py --data DIR --out OUT [--seed 0] [--sorts balance,turned,...]
 
 Writes OUT/triads/CASE__SORT/ with three altered photographs and their truth, one folder for each
 patient and sort. Twelve patients are few; whatever fails on one of these would fail on a
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with triads/")
     parser.add_argument("--out", type=Path, required=True, help="where triads/ is written")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--sorts", default=",".join(SORTS), help="some of them")
+    parser.add_argument("--sorts", default=",".join(SORTS), help=f"some of {', '.join(SORTS)}")
     options = parser.parse_args()
     for number, case in enumerate(sorted((options.data / "triads").iterdir())):
         for sort in options.sorts.split(","):
