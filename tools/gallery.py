@@ -1,4 +1,4 @@
-"""The pictures of `docs/gallery.md`, and the page itself, from the sample data.
+"""The pictures of `docs/gallery.md`, the page itself, and the picture of README and home page.
 
     python tools/gallery.py [--work runs/gallery]
 
@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SAMPLES = ROOT / "data_samples"
 PICTURES = ROOT / "docs" / "gallery"
 PAGE = ROOT / "docs" / "gallery.md"
+#: The picture of README and the site's home page: the preview of the three photographs.
+FIRST = ROOT / "docs" / "preview.jpg"
 #: A picture on the page: its longest side, and JPEG quality.
 SIDE, QUALITY = 960, 82
 WINDOW = (1280, 800)
@@ -270,6 +272,8 @@ def main() -> None:
         *(refused(case, work) for case in refusals()),
     ]  # fmt: skip
     PAGE.write_text("\n".join(sections))
+    preview = cv2.imread(str(work / "three" / "results" / "preview.png"))
+    cv2.imwrite(str(FIRST), preview, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     size = sum(path.stat().st_size for path in PICTURES.iterdir())
     print(
         f"{PAGE.relative_to(ROOT)}, {len(list(PICTURES.iterdir()))} pictures, {size / 1e6:.1f} MB"
