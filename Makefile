@@ -47,7 +47,7 @@ wheel-test: .venv/installed-dev
 docs: .venv/installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir runs/site
 
-# The pictures of the site's gallery, and its page: from the sample data, in some minutes.
+# The pictures of the site's gallery, its page, and README's picture: from the sample data, in some minutes.
 gallery: chromium .venv/installed
 	$(BIN)/python tools/gallery.py
 
