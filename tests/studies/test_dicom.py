@@ -135,6 +135,22 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         assert first.SOPInstanceUID != other.SOPInstanceUID, "another patient's are others"
 
 
+def test_every_file_is_an_object_of_its_own(tmp_path: Path) -> None:
+    """An archive takes two files of one number for one object, and one object is in one series."""
+    one = writing.Picture("view_000.dcm", "a", PREVIEW)
+    same = replace(one, name="view_001.dcm", title="b")
+    other = replace(one, name="preview.dcm", rgb=PREVIEW[::-1])
+    joined = {"StudyInstanceUID": "1.2.840.99.5"}
+    first = writing.data_sets([one, same], [], joined)
+    again = writing.data_sets([one, same, other], [], joined)
+    assert len({made.SOPInstanceUID for made in (*first.values(), *again.values())}) == 5
+    assert first["view_000.dcm"].SeriesInstanceUID != again["view_000.dcm"].SeriesInstanceUID
+    repeated = writing.data_sets([one, same], [], joined)
+    assert [made.SOPInstanceUID for made in repeated.values()] == [
+        made.SOPInstanceUID for made in first.values()
+    ]
+
+
 def test_a_study_to_join(tmp_path: Path) -> None:
     written = write_dicom(
         workspace(tmp_path / "w"), patient={"StudyInstanceUID": "1.2.840.99.5"}, views=0

@@ -65,12 +65,12 @@ def data_sets(
     study = uid("study", said, *(f"{name}:{mark}" for name, mark in sorted(marks.items())))
     found: dict[str, Dataset] = {}
     for number, picture in enumerate(pictures, 1):
-        made = _common(SECONDARY_CAPTURE, "OT", study, patient, (said, marks[picture.name]))
+        made = _common(SECONDARY_CAPTURE, "OT", study, patient, picture.name)
         made.SeriesDescription, made.SeriesNumber = "Rendered views", 1
         _add_picture(made, picture, number)
         found[picture.name] = made
     for number, solid in enumerate(solids, 1):
-        made = _common(ENCAPSULATED_STL, "M3D", study, patient, (said, marks[solid.name]))
+        made = _common(ENCAPSULATED_STL, "M3D", study, patient, solid.name)
         made.SeriesDescription, made.SeriesNumber = "Surfaces", 2
         _add_solid(made, solid, number, study)
         found[solid.name] = made
@@ -81,10 +81,14 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _common(
-    sort: str, modality: str, study: str, patient: Mapping[str, str], content: tuple[str, str]
-) -> Dataset:
-    """Patient, Study, Series, Equipment and SOP Common."""
+def _common(sort: str, modality: str, study: str, patient: Mapping[str, str], name: str) -> Dataset:
+    """Patient, Study, Series, Equipment and SOP Common.
+
+    Args:
+        study: UID that the content of all files, their names and the patient decide.
+        name: of the file. Two files are two objects, also where they show the same, and where one
+            has been sent before with others beside it.
+    """
     made = Dataset()
     made.file_meta = FileMetaDataset()
     made.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
@@ -92,7 +96,7 @@ def _common(
     made.file_meta.ImplementationVersionName = "DENTALSPLAT"
     describe_patient(made, patient, study)
     made.SOPClassUID = made.file_meta.MediaStorageSOPClassUID = UID(sort)
-    made.SOPInstanceUID = uid("instance", sort, made.StudyInstanceUID, *content)
+    made.SOPInstanceUID = uid("instance", made.StudyInstanceUID, study, name)
     made.file_meta.MediaStorageSOPInstanceUID = made.SOPInstanceUID
     made.Modality = modality
     made.SeriesInstanceUID = uid("series", made.StudyInstanceUID, study, modality)
