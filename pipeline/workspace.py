@@ -119,6 +119,13 @@ def read_request(folder: Path) -> dict[str, Any]:
             "known any more. What was computed is kept and used again. Name the photographs and "
             f"settings once more: pipeline run PHOTOGRAPHS -w {quote(str(folder))}"
         ) from error
+    results = folder / "results"
+    if found is None and is_folder(results) and (results / "scene.json").is_file():
+        raise RequestError(
+            f"{folder} holds results alone, as 'pipeline batch --keep results' leaves a case: what "
+            "they were made from is gone. To have it again, run the case once more without --keep "
+            f"results (--retry), or by itself: pipeline run PHOTOGRAPHS -w {quote(str(folder))}"
+        )
     if found is None:
         raise RequestError(
             f"{folder} is not a workspace: no run has been started there. Give the folder that "

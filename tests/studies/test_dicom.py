@@ -202,6 +202,10 @@ def test_what_dicom_does_not_allow_is_refused(
 def test_no_run_no_files(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="is not a workspace"):
         write_dicom(tmp_path)
+    kept = workspace(tmp_path / "k")
+    (kept / "request.json").unlink()
+    with pytest.raises(RequestError, match="results alone, as 'pipeline batch --keep results'"):
+        write_dicom(kept)
     folder = workspace(tmp_path / "w")
     (folder / "results" / "scene.json").unlink()
     with pytest.raises(RequestError, match="no exports"):

@@ -29,7 +29,6 @@ from pipeline.studies.dicom.objects import Picture, Solid, data_sets
 from pipeline.studies.dicom.written import Written
 from pipeline.studies.jobs import results_in
 from pipeline.studies.report.reading import read_case
-from pipeline.workspace import is_workspace
 
 #: Surfaces whose names begin so are not as the reconstruction has them: closed, with a base.
 _MODIFIED = "model"
@@ -55,11 +54,6 @@ def write_all(
 ) -> Written:
     """See `pipeline.studies.dicom.write_dicom`."""
     said = checked(patient)
-    if not is_workspace(workspace):
-        raise RequestError(
-            f"{workspace} is not a workspace: no run has been started there. Give the folder that "
-            "'pipeline run' named, with -w."
-        )
     case = read_case(workspace)
     results = exports_of(case)
     scene = read_json(results / "scene.json")
