@@ -141,6 +141,13 @@ def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> N
         run("cases.csv", retry=["gud"])
 
 
+def test_all_that_failed_is_tried_again_where_a_case_is_called_so(run: Any, tmp_path: Path) -> None:
+    listed(tmp_path, failed="", none="fit.fail=refused")
+    run("cases.csv")
+    run("cases.csv", retry=["failed"])
+    assert computed(tmp_path) == {"fit": 1}, "the store has what came of the good one"
+
+
 def test_a_case_may_take_so_much_time_and_is_tried_again_when_asked(
     run: Any, tmp_path: Path
 ) -> None:

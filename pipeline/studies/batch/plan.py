@@ -193,18 +193,17 @@ def _retried(cases: Sequence[Case], out: Path, retry: Sequence[str]) -> set[str]
     known: Mapping[str, str] = {name: case.id for case in cases for name in (case.name, case.id)}
     found: set[str] = set()
     for name in retry:
-        if name in known:
-            states: tuple[str, ...] = FINAL
-            chosen = [known[name]]
-        elif name == "failed":
-            states = FAILED
-            chosen = [case.id for case in cases]
-        else:
+        asked: dict[str, tuple[str, ...]] = {}
+        if name == "failed":
+            asked |= {case.id: FAILED for case in cases}
+        if name in known:  # also where a case is called 'failed'
+            asked[known[name]] = FINAL
+        if not asked:
             raise RequestError(
                 f"--retry {name}: there is no such case. It may be 'failed', or the name of a case "
                 f"as the summary has it.{nearest(name, known)}"
             )
-        for case in chosen:
+        for case, states in asked.items():
             record = read_case(out, case)
             if record is not None and record["state"] in states:
                 found.add(case)
