@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,14 @@ def test_what_is_stale_is_said(toys: Path) -> None:
     page = pipeline.run_report(toys / "w").read_text()
     assert "Not up to date" in page
     assert "input file changed: 1.txt" in page
+
+
+def test_what_follows_from_a_lost_result_may_be_stale(toys: Path) -> None:
+    start(toys)
+    shutil.rmtree(toys / "w" / "count")
+    page = pipeline.run_report(toys / "w").read_text()
+    (note,) = re.findall(r'<b class="from">Not up to date</b>(.*?)</p>', page)
+    assert note.startswith("Perhaps what follows from a stage that has yet to run: publish.")
 
 
 def test_photographs_that_are_gone_are_no_obstacle(toys: Path) -> None:
