@@ -314,6 +314,27 @@ def test_the_summary_says_how_many_are_found(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+@needs_chromium
+@pytest.mark.parametrize("width", [390, 718])
+def test_a_phone_and_a_sheet_of_paper_show_what_came_of_a_case(tmp_path: Path, width: int) -> None:
+    records = [
+        new_record(Case("x", "anna"), "wrong", "It holds two films; a case is one."),
+        new_record(Case("y", "ben"), "done"),
+    ]
+    write_summary(tmp_path, records, "Batch", "")
+    script = """
+      document.querySelector("[data-state=wrong]").click();
+      const cell = document.querySelector("td.why").getBoundingClientRect();
+      const colour = (each) => getComputedStyle(document.querySelector(each)).color;
+      tell({ right: cell.right, width: cell.width, named: document.querySelector("td.n").dataset.name,
+        hidden: getComputedStyle(document.querySelectorAll("tbody tr")[1]).display,
+        alike: colour(".state.bad") === colour("td.name") });"""
+    told, log = run_in((tmp_path / "summary.html").read_text(), script, tmp_path, (width, 800))
+    assert log == []
+    assert told["right"] <= width and told["width"] > width / 2
+    assert (told["named"], told["hidden"], told["alike"]) == ("teeth", "none", False)
+
+
 def test_the_table_has_all_that_is_measured() -> None:
     assert tuple(rule.name for rule in RULES) == MEASURED
     estimated = {"overbite": {"value": 3.5, "uncertainty": 2.25, "estimated": True}}
