@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -139,6 +140,27 @@ def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> N
         RequestError, match=r"--retry gud: there is no such case.*Did you mean 'good"
     ):
         run("cases.csv", retry=["gud"])
+
+
+def test_the_summary_keeps_up_with_cases_that_end_quickly(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a cluster one ends every moment, and there is never a quiet one."""
+    from pipeline.studies.batch import running
+    from pipeline.studies.batch.records import Case, new_record
+
+    def quick(job: dict[str, Any]) -> dict[str, Any]:
+        time.sleep(0.1)
+        return new_record(Case.from_dict(job["case"]), "done")
+
+    told = []
+    monkeypatch.setattr(running, "run_case", quick)
+    monkeypatch.setattr(running, "SUMMARY", 0.5)
+    monkeypatch.setattr(running, "write_summary", lambda *given: told.append(given[-1]))
+    listed(tmp_path, **{f"c{number}": "" for number in range(30)})
+    run("cases.csv", jobs=1)
+    assert len({text.partition(" done")[0] for text in told}) > 3
+    assert told[-1].startswith("30 done;")
 
 
 def test_all_that_failed_is_tried_again_where_a_case_is_called_so(run: Any, tmp_path: Path) -> None:

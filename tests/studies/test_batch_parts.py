@@ -326,7 +326,8 @@ def test_a_phone_and_a_sheet_of_paper_show_what_came_of_a_case(tmp_path: Path, w
       document.querySelector("[data-state=wrong]").click();
       const cell = document.querySelector("td.why").getBoundingClientRect();
       const colour = (each) => getComputedStyle(document.querySelector(each)).color;
-      tell({ right: cell.right, width: cell.width, named: document.querySelector("td.n").dataset.name,
+      tell({ right: cell.right, width: cell.width,
+        named: document.querySelector("td.n").dataset.name,
         hidden: getComputedStyle(document.querySelectorAll("tbody tr")[1]).display,
         alike: colour(".state.bad") === colour("td.name") });"""
     told, log = run_in((tmp_path / "summary.html").read_text(), script, tmp_path, (width, 800))

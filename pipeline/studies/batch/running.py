@@ -142,7 +142,7 @@ class _Work:
         self._progress, self._title = progress, title
         self._records = dict(plan.records)
         self._left = {case.id for case in plan.waiting}
-        self._written = 0.0
+        self._written = self._looked = 0.0
         self._seen: dict[str, int] = {}
         self._heard = {case.id: _size(self._log(case)) for case in plan.waiting}
         #: Cases that are given out, by the keys of their tasks; a task whose future nobody holds
@@ -196,10 +196,12 @@ class _Work:
                         waiting.appendleft(case)
                     else:
                         self._ended(case, future, total)
-                    continue  # all that have ended come first
+                    if time.monotonic() - self._looked < TICK:
+                        continue  # all that have ended come first
                 if client.status == "closed" and not self._futures:
                     raise _gone()
                 self._look()
+                self._looked = time.monotonic()
                 counts = Counter(record["state"] for record in self._records.values())
                 self._progress.state(counts, total - len(self._left), total)
                 if time.monotonic() - self._written > SUMMARY:
