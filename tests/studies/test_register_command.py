@@ -18,6 +18,7 @@ from pipeline.artifacts.space.scale import Scale
 from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
 from pipeline.studies.register import comparing, run_register, solving
+from pipeline.studies.register.page.writing import tinted
 from pipeline.studies.register.visit import Visit, names_of, read_visit, warning_of
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
@@ -94,6 +95,15 @@ def test_the_command_writes_table_page_and_mesh(written: tuple[Path, Result]) ->
         assert text in page, text
     assert "http" not in page.replace("http-equiv", "")
     assert (out / "movements.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
+
+
+def test_arrows_are_told_of_where_there_are_some(
+    written: tuple[Path, Result], compared: list[comparing.Comparison]
+) -> None:
+    found = compared[0]
+    assert any("arrows" in (shown.caption or "") for shown in tinted(found))
+    still = replace(found, teeth=tuple(replace(tooth, certain=False) for tooth in found.teeth))
+    assert not any("arrows" in (shown.caption or "") for shown in tinted(still))
 
 
 @pytest.mark.parametrize("how", ["-q", "-v"])

@@ -116,11 +116,12 @@ def tinted(found: Comparison) -> list[Picture]:
                 image[inside] + 0.25, 0, 1
             )
         drawn = to_uint8(np.clip(image, 0, 1))
-        for tooth in found.teeth:
-            if tooth.certain and (look.labels == tooth.tooth).any():
-                _arrow(drawn, tooth, camera)
+        moved = [t for t in found.teeth if t.certain and (look.labels == t.tooth).any()]
+        for tooth in moved:
+            _arrow(drawn, tooth, camera)
+        arrows = f"; arrows {ARROW:.0f} times as long" if moved else ""
         alt = f"Photograph {name} of the first visit, coloured by how far each tooth went"
-        result.append(picture(drawn, alt, f"photograph {name}; arrows {ARROW:.0f} times as long"))
+        result.append(picture(drawn, alt, f"photograph {name}{arrows}"))
     return result
 
 
