@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import getpass
-import glob
 import re
 import socket
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,6 +17,7 @@ from pydantic import BaseModel
 from pipeline.config import parse_override
 from pipeline.errors import RequestError
 from pipeline.pages.case import Case, StageRecord
+from pipeline.untrusted.paths import matching
 
 #: Words that photographs, folders and users are called by and that tell nobody's name.
 WORDS = frozenset({
@@ -138,8 +138,7 @@ def _lying_there(images: Iterable[str]) -> Iterator[str]:
     for text in images:
         with contextlib.suppress(OSError, ValueError):
             folder = Path(text)
-            found = folder.iterdir() if folder.is_dir() else glob.iglob(text, recursive=True)  # noqa: PTH207
-            for path in map(Path, found):
+            for path in folder.iterdir() if folder.is_dir() else matching(text):
                 if path.is_file():
                     yield from (path.name, path.stem)
 

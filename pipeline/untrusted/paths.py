@@ -1,7 +1,8 @@
-"""Paths that a setting names."""
+"""Paths and patterns that a user names."""
 
 from __future__ import annotations
 
+import glob
 import os
 from pathlib import Path
 from typing import Annotated, TypeVar, get_args
@@ -35,6 +36,19 @@ def home_told(path: str | Path) -> str:
     """A path with `~` and `~name` replaced, which a shell leaves as they are in quotes and after
     ``--option=``; where there is no such user it stays as it is."""
     return os.path.expanduser(path)  # noqa: PTH111 - Path.expanduser fails there
+
+
+def matching(pattern: str | Path) -> list[Path]:
+    """The files and folders that a pattern fits, such as ``clinic [2024]/anna/*.jpg``.
+
+    Folders on the way that are there mean themselves, also with letters that a pattern gives
+    another meaning.
+    """
+    path = Path(pattern)
+    there = next((p for p in path.parents if os.path.isdir(p)), Path())  # noqa: PTH112 - never raises
+    rest = str(path.relative_to(there))
+    found = glob.glob(os.path.join(glob.escape(str(there)), rest), recursive=True)  # noqa: PTH118, PTH207
+    return [Path(match) for match in found]
 
 
 def _trouble(text: str | Path) -> str | None:

@@ -13,6 +13,7 @@ from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, opened, sort_of
 from pipeline.untrusted.films import KNOWN as KNOWN_FILMS
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.paths import matching
 from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
 from stages.views.sampling import natural_key
 
@@ -221,8 +222,7 @@ def _expand(item: str | Path) -> list[Path]:
 
 
 def _expand_pattern(path: Path) -> list[Path]:
-    pattern = _begun_literally(path)
-    matches = [Path(match) for match in glob.glob(pattern, recursive=True)]  # noqa: PTH207
+    matches = matching(path)
     usable = [m for m in matches if not m.is_dir() and (is_photograph(m) or is_video(m))]
     if not usable:
         what = (
@@ -237,12 +237,6 @@ def _expand_pattern(path: Path) -> list[Path]:
     for match in usable:
         _refuse_special(match, "Among the photographs,")
     return usable
-
-
-def _begun_literally(pattern: Path) -> str:
-    """A pattern whose first folders mean themselves, as far as there are such: ``p [1]/*.jpg``."""
-    there = next(parent for parent in pattern.parents if _stat(parent) is not None)
-    return str(Path(glob.escape(str(there)), pattern.relative_to(there)))
 
 
 def _refuse_special(path: Path, what: str) -> None:

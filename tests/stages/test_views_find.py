@@ -123,6 +123,18 @@ def test_files_patterns_and_repeats(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(find_images(["~/*.png"])) == 3
 
 
+def test_folders_on_the_way_to_a_pattern_mean_themselves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path, "clinic [2024]/b*b/1.png", "clinic [2024]/bob/2.png", "clinic 2/bob/3.png")
+    assert list(find_images([tmp_path / "clinic [2024]" / "b*b" / "*.png"])) == ["1.png"]
+    assert list(find_images([tmp_path / "clinic [2024]" / "**" / "*.png"])) == ["1.png", "2.png"]
+    assert list(find_images([tmp_path / "clinic [0-9]" / "*" / "*.png"])) == ["3.png"]
+    monkeypatch.chdir(tmp_path / "clinic [2024]")
+    assert list(find_images([Path("bo?/*.png").absolute()])) == ["2.png"]
+    assert list(find_images(["*/1.png"])) == ["1.png"]
+
+
 def test_equal_names_get_their_folders(tmp_path: Path) -> None:
     touch(tmp_path, "p/left/1.png", "p/right/1.png", "q/right/1.png", "p/2.png", "p/masks/3.png",
           "q/masks/2.png")  # fmt: skip
