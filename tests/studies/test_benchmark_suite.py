@@ -157,10 +157,10 @@ def test_suites_that_come_with_dentalsplat(name: str, tmp_path: Path) -> None:
 def test_names_with_brackets_are_no_patterns(folder: Path) -> None:
     data = folder / "data [1]"
     (data / "frames").mkdir(parents=True)
-    for name in ("a[2].png", "b.png"):
+    for name in ("a[2].png", "b.png", "b1²2.png"):
         (data / "frames" / name).write_bytes(b"")
     for images, names in {
-        "frames/*.png": ["a[2].png", "b.png"], "frames/a[2].png": ["a[2].png"],
+        "frames/*.png": ["a[2].png", "b.png", "b1²2.png"], "frames/a[2].png": ["a[2].png"],
     }.items():  # fmt: skip
         loaded = load_suite(written(folder, scenes=[{"name": "mouth", "images": images}]), data)
         found = pictures_of(loaded.images(loaded.suite.scenes[0]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import glob
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import RequestError
+from pipeline.untrusted.paths import matching
 
 PICTURE_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp",
@@ -43,6 +42,8 @@ def pictures_of(images: Sequence[Path]) -> list[Path]:
     Raises:
         RequestError: there are none, or two of the same name.
     """
+    from stages.views.sampling import natural_key
+
     found: list[Path] = []
     for place in images:
         if place.is_dir():
@@ -50,9 +51,10 @@ def pictures_of(images: Sequence[Path]) -> list[Path]:
         elif place.is_file():
             found.append(place)
         else:
-            found += [Path(name) for name in glob.glob(str(place))]  # noqa: PTH207 - absolute
+            found += matching(place)
     where = ", ".join(map(str, images))
-    found = sorted((p for p in found if p.is_file() and p.name[:1] != "."), key=_natural_key)
+    found = [path for path in found if path.is_file() and path.name[:1] != "."]
+    found.sort(key=lambda path: natural_key(path.name))
     if not found:
         raise RequestError(
             f"{where}: no photographs ({', '.join(PICTURE_SUFFIXES)}). A scene of a benchmark is "
@@ -105,8 +107,3 @@ def split_views(files: list[Path], protocol: str, views: int | None, test_every:
         )
     chosen = np.linspace(0, len(pool) - 1, count).astype(int).tolist()
     return Split(tuple(pool[k] for k in chosen), tuple(files[k] for k in sorted(held)))
-
-
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(int(part) if part.isdigit() else -1, part) for part in parts]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -145,10 +144,7 @@ class LoadedSuite:
 
     def images(self, scene: Scene) -> list[Path]:
         """What a scene names as its photographs, absolute: folders, files or patterns."""
-        # The folder of the data is none, whatever it is called.
-        patterns = [Path(glob.escape(str(self.data)), path) for path in scene.images]
-        named = zip(map(self.file, scene.images), patterns, strict=True)
-        return [file if file.exists() else pattern for file, pattern in named]
+        return [self.file(path) for path in scene.images]
 
     def preset(self, method: Method) -> str:
         """A preset's name, or its YAML file, looked for beside the suite."""
