@@ -64,7 +64,7 @@ def number(value: Any, digits: int = 2) -> str:
         return "–"
     if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
         return f"{int(value):,}"
-    return f"{value:,.{digits}f}"
+    return f"{value:z,.{digits}f}"
 
 
 def seconds(value: float | None) -> str:

@@ -27,7 +27,7 @@ from pipeline.pages.charts import (
     series_chart,
 )
 from pipeline.pages.directions import movement, similarity_onto
-from pipeline.pages.page import seconds
+from pipeline.pages.page import number, seconds
 from pipeline.pages.pictures import picture, points_image, thirds
 from pipeline.pages.tables import views_table
 from pipeline.running.outcomes import RunSummary
@@ -123,6 +123,16 @@ def test_dollars_in_names_are_no_formula() -> None:
         bar_chart([Bar(name, 1.0)], "x", "bars"),
     ):
         assert f">{name}<" in chart.svg, chart.alt
+
+
+def test_names_in_any_letters_are_drawn_without_a_word(recwarn: pytest.WarningsRecorder) -> None:
+    name = "患者"
+    chart = match_matrix([name, "b"], {(0, 1): 5})
+    assert f">{name}<" in chart.svg and not recwarn.list
+
+
+def test_nothing_is_written_with_a_sign() -> None:
+    assert (number(-0.04, 1), number(-0.06, 1), number(-1234.5)) == ("0.0", "-0.1", "-1,234.50")
 
 
 @needs_chromium
