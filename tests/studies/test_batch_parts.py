@@ -71,6 +71,8 @@ def test_what_lies_in_a_folder_of_cases(tmp_path: Path) -> None:
     pictures(tmp_path / "masked" / "masks")
     pictures(tmp_path / "masked")
     pictures(tmp_path / ".hidden")
+    pictures(tmp_path / "$RECYCLE.BIN" / "S-1-5-21")
+    pictures(tmp_path / "a" / "#recycle")
     (tmp_path / "film").mkdir()
     (tmp_path / "film" / "x.mp4").write_bytes(b"x")
     (tmp_path / "films").mkdir()
@@ -91,6 +93,7 @@ def test_what_lies_in_a_folder_of_cases(tmp_path: Path) -> None:
     run = {"a", "clinic/2024/b", "c", "masked", "film", "one"}
     wrong = {"both", "films", "empty", r"\xff"}
     skipped = {".hidden", "text.pdf", "1.jpg", "a link", "clinic/up", "self", "dead", "pipe"}
+    skipped.add("$RECYCLE.BIN")
     assert states(found) == {
         **dict.fromkeys(run, ""), **dict.fromkeys(wrong, "wrong"),
         **dict.fromkeys(skipped, "skipped"),

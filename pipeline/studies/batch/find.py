@@ -27,6 +27,10 @@ MOST_FOREIGN = 50
 LONGEST_NAME = 60
 #: Folders of pictures that go with the photographs of a case and are none.
 BESIDE = {"masks", "mask", "depth", "depths", "thumbnails"}
+#: Folders that systems make for what was deleted, for thumbnails, and for what only they read.
+SYSTEMS = {
+    "$recycle.bin", "#recycle", "@eadir", "__macosx", "lost+found", "system volume information",
+}  # fmt: skip
 #: Names that mean a device on Windows, whatever comes after a dot.
 _DEVICES = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\.|$)")
 
@@ -187,8 +191,8 @@ def _folder(
     seen: dict[tuple[int, int], str],
 ) -> Iterator[Case]:
     """One folder: a case, folders of cases, or neither."""
-    if folder.name.startswith("."):
-        yield Case("", called, settled="skipped", reason="A hidden folder: not looked into.")
+    if why := _out_of_sight(folder):
+        yield Case("", called, settled="skipped", reason=f"{why}: not looked into.")
         return
     try:
         identity, entries = _identity(folder), _entries(folder)
@@ -205,7 +209,7 @@ def _folder(
         return
     pictures = [path for path, kind in entries if kind == "picture" and path.name[0] != "."]
     films = [path for path, kind in entries if kind == "film" and path.name[0] != "."]
-    inner = [path for path, kind in entries if kind == "folder" and path.name[0] != "."]
+    inner = [path for path, kind in entries if kind == "folder" and not _out_of_sight(path)]
     if pictures or films:
         seen[identity] = called
         yield _leaf(folder, called, pictures, films, inner)
@@ -218,6 +222,13 @@ def _folder(
         yield Case("", called, settled="wrong", reason=why)
     else:
         yield as_case(called, [folder])  # which says what it holds instead
+
+
+def _out_of_sight(folder: Path) -> str:
+    """What a folder is that people don't put photographs into; empty: not such a one."""
+    if folder.name.startswith("."):
+        return "A hidden folder"
+    return "A folder of the system's own" if folder.name.lower() in SYSTEMS else ""
 
 
 def _leaf(
