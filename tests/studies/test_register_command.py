@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,13 @@ from typer.testing import CliRunner
 from pipeline.artifacts.space.scale import Scale
 from pipeline.cli import app
 from pipeline.errors import ReconstructionError, RequestError
+from pipeline.store import Store
 from pipeline.studies.register import comparing, run_register, solving
 from pipeline.studies.register.page.writing import tinted
 from pipeline.studies.register.visit import Visit, names_of, read_visit, warning_of
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
+from tests.studies.report_case import write_result
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +132,20 @@ def test_the_command_says_nothing_or_each_step(
 def test_no_workspace_is_said(workspaces: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="not a workspace"):
         run_register(workspaces[0], tmp_path)
+
+
+def test_a_run_that_was_begun_anew_is_refused(tmp_path: Path) -> None:
+    """Its photographs or teeth are not those any more that its scene was made from."""
+    workspace = write_visit(tmp_path / "w 1", toy_visit("first"))
+    store = Store(workspace)
+    fitted = store.current("fit")
+    assert fitted is not None
+    scene = store.load(fitted, "gaussians")
+    shutil.rmtree(workspace / "fit")
+    before = {"views": {"stage": "views", "content": "of other photographs"}}
+    write_result(workspace, "fit", [scene], inputs=before)
+    with pytest.raises(RequestError, match=r"another result of 'views'.*pipeline run -w '"):
+        read_visit(workspace)
 
 
 def test_photographs_that_both_visits_hold_are_named(

@@ -8,7 +8,8 @@ from shlex import quote
 
 from pipeline.errors import RequestError
 from pipeline.pages.case import Case, StageRecord
-from pipeline.store import Result, Store
+from pipeline.store import Store
+from pipeline.studies.report.reading import renewed
 
 #: The stage that makes them, and what kind of artifact they are.
 STAGE, KIND = "export", "exports"
@@ -42,7 +43,7 @@ def exports_of(case: Case) -> Path:
     result = store.current(STAGE)
     if result is None:
         return case.workspace / "results"
-    if other := _renewed(store, result):
+    if other := renewed(store, result):
         raise RequestError(_unfinished(case.workspace, f"'{other}' has another result by now"))
     return result.folder / KIND
 
@@ -67,14 +68,3 @@ def _aged(record: StageRecord) -> bool:
     mine = re.escape(record.name)
     newer = re.compile(rf"library |{mine} (?:version|backend) |{mine}\.\S+ \(absent\) ")
     return bool(record.reasons) and all(map(newer.match, record.reasons))
-
-
-def _renewed(store: Store, result: Result) -> str | None:
-    """The stage whose result in use is not the one that a result, or one before it, came from."""
-    for kind, source in result.manifest["inputs"].items():
-        used = store.current(source["stage"])
-        if used is None or used.contents.get(kind) != source["content"]:
-            return str(source["stage"])
-        if other := _renewed(store, used):
-            return other
-    return None

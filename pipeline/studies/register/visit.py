@@ -19,6 +19,7 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
 from pipeline.geometry.world import move_camera
+from pipeline.store import Store
 from pipeline.studies.register.pictures.hardware import braces_in, painted_over
 from pipeline.studies.register.pictures.originals import larger_photographs
 
@@ -173,9 +174,9 @@ def read_visit(workspace: Path) -> Visit:
     """Read a finished run.
 
     Raises:
-        RequestError: no run, an unfinished one, or one without teeth.
+        RequestError: no run, an unfinished one, one that was begun anew, or one without teeth.
     """
-    from pipeline.studies.report.reading import read_case
+    from pipeline.studies.report.reading import read_case, renewed
     from stages.dentition.working import labels_in_view
     from stages.splatting.rendering import Painter
     from stages.views.find import MASK_PREFIX
@@ -195,6 +196,12 @@ def read_visit(workspace: Path) -> Visit:
                 f"{workspace} holds no result of the stage '{stage}': finish the run first "
                 f"(pipeline run -w {quote(str(workspace))})."
             )
+    fitted = case.by_name[case.providers("gaussians")[-1]].result
+    if fitted and (other := renewed(Store(workspace), fitted)):
+        raise RequestError(
+            f"{workspace}: its scene was made from another result of '{other}' than there is now. "
+            f"Run the pipeline to its end first: pipeline run -w {quote(str(workspace))}"
+        )
     frame = np.asarray(cameras.input_from_world, np.float64)
     read, by_name = teeth.by_name(), views.by_name()
     larger, lost = larger_photographs(case, views.views)

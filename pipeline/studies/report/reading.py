@@ -95,3 +95,14 @@ def _with_taken(found: list[StageStatus], store: Store, config: Config | None) -
             at = next(later, len(every))
             every.insert(at, StageStatus(name, "cached", ["taken as it was"]))
     return every
+
+
+def renewed(store: Store, result: Result) -> str | None:
+    """The stage whose result in use is not the one that a result, or one before it, came from."""
+    for kind, source in result.manifest["inputs"].items():
+        used = store.current(source["stage"])
+        if used is None or used.contents.get(kind) != source["content"]:
+            return str(source["stage"])
+        if other := renewed(store, used):
+            return other
+    return None
