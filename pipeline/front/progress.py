@@ -136,7 +136,7 @@ class LiveReporter(Reporter):
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._console = Console(stderr=True, highlight=False)
+        self._console = Console(stderr=True, highlight=False, emoji=False)
         self._display = Progress(
             TextColumn("[bold]{task.fields[stage]:>9}[/]"),
             BarColumn(bar_width=24),

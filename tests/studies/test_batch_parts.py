@@ -20,10 +20,12 @@ from pipeline.artifacts.space.frames import Frame
 from pipeline.artifacts.space.scale import Scale
 from pipeline.errors import RequestError
 from pipeline.files import sha256_file, write_json
+from pipeline.front.progress import LiveReporter
 from pipeline.studies.batch.find import MOST_FOREIGN, Names, find_cases
 from pipeline.studies.batch.keep import keep_results, write_thumbnail
 from pipeline.studies.batch.listing import read_cases
 from pipeline.studies.batch.plan import check_folder, make_plan
+from pipeline.studies.batch.progress import Bar
 from pipeline.studies.batch.records import Case, new_record, write_case
 from pipeline.studies.batch.sources import contents_of, settings_of
 from pipeline.studies.batch.summary import MEASURED, csv_text, write_summary
@@ -337,6 +339,12 @@ def test_a_phone_and_a_sheet_of_paper_show_what_came_of_a_case(tmp_path: Path, w
     assert log == []
     assert told["right"] <= width and told["width"] > width / 2
     assert (told["named"], told["hidden"], told["alike"]) == ("teeth", "none", False)
+
+
+def test_a_terminal_shows_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    for bar in (Bar(), LiveReporter()):
+        bar.message("ward:on:3 [b]")
+    assert capsys.readouterr().err == 2 * "ward:on:3 [b]\n"
 
 
 def test_the_table_has_all_that_is_measured() -> None:

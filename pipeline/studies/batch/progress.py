@@ -91,7 +91,7 @@ class Bar(Lines):
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._console = Console(stderr=True, highlight=False)
+        self._console = Console(stderr=True, highlight=False, emoji=False)
         self._display = Progress(
             TextColumn("[bold]cases[/]"), BarColumn(bar_width=24),
             TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
