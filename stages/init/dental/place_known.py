@@ -64,8 +64,7 @@ ROUNDS = (
     SweepRound(reach=1.5, step=0.05, window=0.6, prior=0.1, stiffness=4.0),
     SweepRound(reach=1.0, step=0.05, window=0.5, prior=0.1, stiffness=4.0),
 )
-#: Matches that are seen at a low angle (cosine) are still worth more than none. Gum may be further
-#: from the usual colour: what is no gum at all does not match.
+#: Matches that are seen at a low angle (cosine) are still worth more than none.
 LEAST_FACING = 0.2
 #: Where no photographs agree, the charts are still mm and not cm off, unlike what is filled in
 #: around them: a guess, half way from `FILLED` to `MEASURED` (confidence is 1 + exp of this).
@@ -92,10 +91,14 @@ def from_known_teeth(
     placed, cameras = [view for view, _ in pairs], [camera for _, camera in pairs]
     posed = replace(views, views=tuple(placed))
     held = held_teeth(context, posed, cameras)
+    jaws = None
+    if config.dental.mask_rest is not True:  # the scene goes on beyond the gum
+        jaws = [d.on_jaws_mask if d else None for d in held.dentitions]
+        held = replace(held, dentitions=[d and replace(d, on_jaws=None) for d in held.dentitions])
     # with cameras that are exact the charts may go on as far as they are
     teeth = with_surface(
         held.placed(context, posed, cameras, config.dental.accept_doubtful),
-        replace(held.surface, past_row=None), context.threads, context.progress,
+        replace(held.surface, past_row=None), context.threads, context.progress, jaws,
     )  # fmt: skip
     for doubt in (*teeth.fit.doubts, *numbered_otherwise(teeth, config.dental.min_margin)):
         context.warn(doubt)

@@ -22,12 +22,14 @@ from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.odd_ones import without_odd_ones
 from stages.init.dental.solution import ArchFit, PlacedView
+from stages.init.dental.surface.beyond import without_guesses_beyond
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photos.photo import FullSize
 from stages.init.dental.turned_sheet import turned_sheet
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 Picture = npt.NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 
@@ -213,14 +215,22 @@ def with_whole_crowns(
 
 
 def with_surface(
-    teeth: PlacedTeeth, surface: SurfaceOptions, threads: int, progress: Progress
-) -> Reconstruction:
-    """The teeth with their dense surface."""
+    teeth: PlacedTeeth, surface: SurfaceOptions, threads: int, progress: Progress,
+    jaws: Sequence[Mask | None] | None = None,
+) -> Reconstruction:  # fmt: skip
+    """The teeth with their dense surface.
+
+    Args:
+        jaws: where each photograph [H, W] shows tooth or gum, if its dentition is without that;
+            what is only guessed beyond is left out.
+    """
     small = teeth.small
     dense = dense_surface(
         [view.image for view in small.views], [view.valid() for view in small.views],
         small.dentitions, small.fit, surface, threads, progress, teeth.full,
     )  # fmt: skip
+    if jaws is not None:
+        dense = without_guesses_beyond(dense, teeth.fit, jaws)
     return Reconstruction(
         teeth.views, teeth.dentitions, teeth.fit, dense, turned_sheet(dense), small.mirrored,
         small.left_out, small.reasons,
