@@ -293,10 +293,7 @@ def _write(
 def _camera(view: View, teeth: Reconstruction, number: int) -> Camera:
     placed = teeth.fit.views[number]
     assert placed is not None
-    return Camera(
-        view.name, view.width, view.height, placed.focal, placed.focal,
-        view.width / 2, view.height / 2, placed.cam_from_world,
-    )  # fmt: skip
+    return placed.camera(view.name, view.width, view.height)
 
 
 def _masked(view: View, teeth: Reconstruction, number: int, mask_rest: bool) -> View:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import Jaw, primary_of
 from stages.init.dental.landmarks import Landmark
 
@@ -39,6 +40,12 @@ class PlacedView:
     error: float
     upper_doubts: tuple[float, ...] = ()
     lower_doubts: tuple[float, ...] = ()
+
+    def camera(self, name: str, width: int, height: int) -> Camera:
+        """Its camera, for the working image of that many pixels."""
+        return Camera(
+            name, width, height, self.focal, self.focal, width / 2, height / 2, self.cam_from_world
+        )
 
     def teeth(self, jaw: Jaw) -> tuple[int, ...]:
         """FDI numbers of the crowns of one jaw."""

@@ -60,11 +60,9 @@ def _where(kept: Mask, found: SurfaceView) -> SurfaceView:
 def _lies_on(mask: Mask, points: npt.NDArray[np.float32], placed: PlacedView) -> Mask:
     """[N] bool: where a photograph [H, W] would show points [N, 3], its mask is True."""
     height, width = mask.shape
-    camera = placed.cam_from_world
-    x, y, z = (points @ camera[:3, :3].T + camera[:3, 3]).T
-    before = z > 0
-    depth = np.where(before, z, 1)
-    column = np.floor(placed.focal * x / depth + width / 2).astype(int)
-    row = np.floor(placed.focal * y / depth + height / 2).astype(int)
-    inside = before & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return inside & mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    camera = placed.camera("", width, height)
+    pixels, depths = camera.project(points)
+    lies = camera.shows(pixels, depths)
+    column, row = pixels[lies].astype(int).T
+    lies[lies] = mask[row, column]
+    return lies
