@@ -239,13 +239,11 @@ class _Local:
 
 def _resampled(polygon: Array, step: float) -> Array:
     """[N, 2] points on a polygon's sides, no further apart than step."""
-    after = np.roll(polygon, -1, axis=0)
-    lengths = np.linalg.norm(after - polygon, axis=1)
-    parts = [
-        a + np.linspace(0, 1, max(1, math.ceil(length / step)), endpoint=False)[:, None] * (b - a)
-        for a, b, length in zip(polygon, after, lengths, strict=True)
-    ]
-    return np.concatenate(parts)
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    parts = np.maximum(np.ceil(np.linalg.norm(sides, axis=1) / step), 1).astype(int)
+    side = np.repeat(np.arange(len(polygon)), parts)
+    part = np.arange(len(side)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return polygon[side] + (part * (1 / parts)[side])[:, None] * sides[side]
 
 
 def outermost(along: Array, height: Array, flatness: float) -> tuple[float, float]:

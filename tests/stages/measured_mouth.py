@@ -19,40 +19,39 @@ from stages.dentition.crowns import dentition_of
 from stages.export.measuring.places import with_primary
 from tests.stages.mouth_case import outlines_of
 
-WIDTH, HEIGHT = 640, 480
 #: Degrees from the patient's left, and from above.
 YAWS = ((-42.0, 4.0), (3.0, 4.0), (40.0, 4.0))
 
 
 def photographed(
-    mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS
+    mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS, size: tuple[int, int] = (640, 480)
 ) -> tuple[list[Dentition], list[Camera], list[np.ndarray]]:
-    """Exact outlines with true numbers, cameras and depth, from some yaws and pitches."""
+    """Exact outlines with true numbers, cameras and depth, from some yaws and pitches.
+
+    Args:
+        mouth: what is photographed.
+        angles: yaw and pitch of each photograph, degrees.
+        size: width, height of the photographs.
+    """
+    width, height = size
     scene = ray_scene((mouth.vertices, mouth.triangles))
     dentitions, cameras, depths = [], [], []
     for k, (yaw, pitch) in enumerate(angles):
-        focal = 1.9 * WIDTH
-        true = TrueCamera(
-            WIDTH,
-            HEIGHT,
-            focal,
-            focal,
-            WIDTH / 2,
-            HEIGHT / 2,
-            look(yaw, pitch, 2.0, 125.0, mouth.pivot),
-        )
-        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        focal = 1.9 * width
+        pose = look(yaw, pitch, 2.0, 125.0, mouth.pivot)
+        true = TrueCamera(width, height, focal, focal, width / 2, height / 2, pose)
+        v, u = np.mgrid[:height, :width] + 0.5
         hit = cast(scene, true.rays(np.stack([u, v], -1).reshape(-1, 2)))
         seen = np.isfinite(hit["t_hit"])
-        labels = np.zeros(WIDTH * HEIGHT, np.uint8)
+        labels = np.zeros(width * height, np.uint8)
         labels[seen] = mouth.fdi[mouth.triangles[hit["primitive_ids"][seen], 0]]
-        depth = np.where(seen, hit["t_hit"], 0).reshape(HEIGHT, WIDTH)
-        labels = labels.reshape(HEIGHT, WIDTH)
+        depth = np.where(seen, hit["t_hit"], 0).reshape(height, width)
+        labels = labels.reshape(height, width)
         # 18 etc. are no numbers of ours
-        read = dentition_of(outlines_of(labels, tell=False), f"{k:03d}", (WIDTH, HEIGHT), "front")
+        read = dentition_of(outlines_of(labels, tell=False), f"{k:03d}", (width, height), "front")
         dentitions.append(numbered(read, labels))
         cameras.append(
-            Camera(f"{k:03d}", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2,
+            Camera(f"{k:03d}", width, height, focal, focal, width / 2, height / 2,
                    true.cam_from_world)
         )  # fmt: skip
         depths.append(depth)

@@ -20,6 +20,8 @@ from tests.stages.mouth_case import CALM
 
 MM = Scale("mm", "length", 0.0)
 UP = np.array([0.0, 1.0, 0.0])
+SIZE = (480, 360)
+_GROWN: dict[int, Mouth] = {}
 
 
 @cache
@@ -27,9 +29,20 @@ def grown(seed: int, **options: object) -> Mouth:
     return random_mouth(np.random.default_rng(seed), **{**CALM, **options})
 
 
-def measured(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS, scale=MM):
-    reading = read_landmarks(*photographed(mouth, angles))
-    return {entry["name"]: entry for entry in measure_mouth(reading, UP, scale)}
+@cache
+def _photographed(mouth_id: int, angles: tuple[tuple[float, float], ...]):
+    return photographed(_GROWN[mouth_id], angles, SIZE)
+
+
+def seen(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS):
+    """Its photographs, taken once."""
+    _GROWN[id(mouth)] = mouth
+    return _photographed(id(mouth), angles)
+
+
+def measured(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS):
+    reading = read_landmarks(*seen(mouth, angles))
+    return {entry["name"]: entry for entry in measure_mouth(reading, UP, MM)}
 
 
 OPEN = {"overbite": -2.0, "bite": "open", "overjet": 1.5}
@@ -88,7 +101,7 @@ def test_an_estimate_follows_the_bite_and_errs_with_the_crowns_height() -> None:
 
 
 def test_an_estimate_needs_no_scale() -> None:
-    reading = read_landmarks(*photographed(grown(8, overbite=3.0)))
+    reading = read_landmarks(*seen(grown(8, overbite=3.0)))
     larger = replace(
         reading,
         landmarks={
@@ -117,7 +130,7 @@ def test_an_estimate_needs_no_scale() -> None:
 
 def test_an_overbite_is_less_sure_where_one_of_the_incisors_is_covered() -> None:
     """It is that of the others, and too small: the covered one reaches higher."""
-    reading = read_landmarks(*photographed(grown(2, **OPEN)))
+    reading = read_landmarks(*seen(grown(2, **OPEN)))
     marks = {key: mark for key, mark in reading.landmarks.items() if key != ("tip", 31)}
     one = replace(reading, landmarks=marks, covered=reading.covered | {31})
     both, left = (
@@ -137,7 +150,7 @@ def test_what_can_not_be_estimated_either_says_why() -> None:
     assert reverse["value"] is None
     assert "estimated" not in reverse["not_visible"]
 
-    dentitions, cameras, depths = photographed(grown(8, overbite=3.0))
+    dentitions, cameras, depths = seen(grown(8, overbite=3.0))
     cut = [
         replace(d, lower=tuple(replace(c, doubtful=c.number in (31, 41)) for c in d.lower))
         for d in dentitions
@@ -177,7 +190,7 @@ def test_a_tooth_that_is_not_there_is_named() -> None:
 
 
 def test_doubtful_numbers_give_nothing() -> None:
-    dentitions, cameras, depths = photographed(grown(0))
+    dentitions, cameras, depths = seen(grown(0))
     unsure = [replace(d, upper=tuple(replace(c, doubt=0.7) for c in d.upper)) for d in dentitions]
     found = {e["name"]: e for e in measure_mouth(read_landmarks(unsure, cameras, depths), UP, MM)}
     assert found["overjet"]["not_visible"] == "it is not sure which tooth is 11 or 21"
@@ -200,7 +213,7 @@ def test_the_axes_are_the_mouths_own() -> None:
 def test_the_upper_edges_that_a_scene_draws_too_long_make_no_reverse_bite(seed: int) -> None:
     """Beside the upper edges a scene may show their depth where the lower crowns are seen."""
     mouth = grown(seed, overjet=5.0)
-    dentitions, cameras, depths = photographed(mouth)
+    dentitions, cameras, depths = seen(mouth)
     drawn = []
     for dentition, depth in zip(dentitions, depths, strict=True):
         upper = filled(dentition.upper, dentition.size)
