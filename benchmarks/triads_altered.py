@@ -117,10 +117,55 @@ def grey(image: Floats, rng: Rng) -> Altered:
     return np.repeat(_encoded(light)[..., None], 3, axis=2), np.eye(2, 3)
 
 
+def bright(image: Floats, rng: Rng) -> Altered:
+    """A stop too bright: enamel in the flash is white."""
+    return _encoded(2 * _linear(image)), np.eye(2, 3)
+
+
+def dark(image: Floats, rng: Rng) -> Altered:
+    """Two stops too dark, with the noise of that."""
+    noisy = _encoded(_linear(image) / 4) + rng.normal(size=image.shape) * 0.02
+    return np.clip(noisy, 0, 1), np.eye(2, 3)
+
+
+def hazy(image: Floats, rng: Rng) -> Altered:
+    """Through breath on the lens: a quarter of the light scattered all over, some of it near by."""
+    light = _linear(image)
+    around = cv2.GaussianBlur(light, (0, 0), max(image.shape) / 20)
+    veil = 0.5 * around + 0.5 * light.mean()
+    return _encoded(0.75 * light + 0.25 * veil + 0.05), np.eye(2, 3)
+
+
+def warm(image: Floats, rng: Rng) -> Altered:
+    """Under a lamp of 3,200 K that the camera took for daylight."""
+    return _encoded(_linear(image) * (1.35, 1.0, 0.6)), np.eye(2, 3)
+
+
+def vivid(image: Floats, rng: Rng) -> Altered:
+    """As phones beautify: colours and contrast half as strong again, edges sharpened."""
+    grey_ = image.mean(axis=2, keepdims=True)
+    strong = grey_ + 1.5 * (image - grey_)
+    strong = strong.mean() + 1.3 * (strong - strong.mean())
+    near = cv2.GaussianBlur(strong, (0, 0), max(image.shape) / 500)
+    return np.clip(strong + 0.8 * (strong - near), 0, 1), np.eye(2, 3)
+
+
+def flash(image: Floats, rng: Rng) -> Altered:
+    """A flash that lights the middle: corners two stops darker, each photograph's elsewhere."""
+    height, width = image.shape[:2]
+    x, y = rng.uniform(0.35, 0.65, 2) * (width, height)
+    v, u = np.mgrid[:height, :width]
+    far = np.hypot(u - x, v - y) / (np.hypot(width, height) / 2)
+    return _encoded(_linear(image) * (1.3 * 2 ** (-2 * far**2))[..., None]), np.eye(2, 3)
+
+
 SORTS: dict[str, Callable[[Floats, Rng], Altered]] = {
     made.__name__: made
-    for made in (balance, exposure, turned, cut, small, soft, everything, over, grey)
-}
+    for made in (
+        balance, exposure, turned, cut, small, soft, everything, over, grey, bright, dark, hazy,
+        warm, vivid, flash,
+    )
+}  # fmt: skip
 
 
 def _moved(entry: dict[str, Any], size: tuple[int, int], altered: Altered) -> dict[str, Any] | None:

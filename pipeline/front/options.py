@@ -47,20 +47,21 @@ Images = Annotated[
         show_default=False,
     ),
 ]
-Workspace = Annotated[
-    Path | None,
-    typer.Option(
-        "-w", "--workspace", metavar="FOLDER", parser=path,
-        help="Where results are kept.  [default: ./runs/NAME_OF_IMAGES]",
-    ),
-]  # fmt: skip
+
+
+def _workspace(meaning: str, default: str) -> Any:
+    return typer.Option(
+        "-w", "--workspace", metavar="FOLDER", parser=path, help=f"{meaning}  [default: {default}]"
+    )
+
+
+#: Of commands that run.
+Workspace = Annotated[Path | None, _workspace("Where results are kept.", "./runs/NAME_OF_IMAGES")]
+#: Of commands that look at what was run.
 OldWorkspace = Annotated[
     Path | None,
-    typer.Option(
-        "-w", "--workspace", metavar="FOLDER", parser=path,
-        help="Where a run keeps its results.  [default: this folder, or the only one in ./runs]",
-    ),
-]  # fmt: skip
+    _workspace("Where a run keeps its results.", "this folder, or the only one in ./runs"),
+]
 Preset = Annotated[
     str | None,
     typer.Option(
