@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ReconstructionError
+from pipeline.process.native import one_blas_thread
 from pipeline.studies.register import solving
 from pipeline.studies.register.both_ways import both_ways, mirrored
 from pipeline.studies.register.estimate import Estimate
@@ -119,6 +120,7 @@ class Comparison:
         return [tooth.tooth for tooth in self.teeth if tooth.still]
 
 
+@one_blas_thread()
 def compare_visits(first: Visit, second: Visit) -> Comparison:
     """Bring two visits into one frame and measure what the teeth did.
 
