@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from filelock import FileLock
 from hypothesis import settings
 
 import pipeline
+from pipeline.process.native import one_blas_thread
 from pipeline.running.outcomes import RunSummary
 from tests.personal_data import with_personal_data
 
@@ -24,6 +26,16 @@ SHORT = {
 # How long an example takes is the machine's affair, which may be busy.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+# Tests start hundreds of processes: the first one compiles the modules, not each.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def calm_blas() -> Iterator[None]:
+    """As stages have it: OpenBLAS's threads would spin beside other tests that need the cores."""
+    with one_blas_thread():
+        yield
 
 
 @pytest.fixture(scope="session")

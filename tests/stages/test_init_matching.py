@@ -68,7 +68,7 @@ def test_matches_are_the_true_ones():
 def test_matches_do_not_depend_on_block_or_blas_threads(monkeypatch):
     first, second, _ = pair_of_views(400, 200, noise=12)
     expected = match_features(first, second)
-    with threadpool_limits(1, "blas"):
+    with threadpool_limits(2, "blas"):
         np.testing.assert_array_equal(match_features(first, second), expected)
     monkeypatch.setattr("stages.init.sfm.matching.match.BLOCK_ROWS", 37)
     np.testing.assert_array_equal(match_features(first, second), expected)
