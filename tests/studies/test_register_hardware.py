@@ -42,6 +42,11 @@ def visit_of(looks: tuple[Look, ...]) -> Visit:
     return Visit("braces", looks, teeth_points(looks))
 
 
+def upper(looks: tuple[Look, ...]) -> tuple[Look, ...]:
+    """Photographs on which the upper teeth alone have numbers."""
+    return tuple(replace(a, labels=np.where(a.labels < 30, a.labels, 0)) for a in looks)
+
+
 def told(visit: Visit) -> Visit:
     return without_braces(visit, [coloured(look) for look in visit.looks])
 
@@ -50,7 +55,7 @@ def test_teeth_are_followed_under_braces_that_were_put_on() -> None:
     first = toy_visit("before")
     looks = tuple(bracketed(look) for look in toy_visit("after", toy_motions()).looks)
     with pytest.raises(ReconstructionError, match="two visits of one patient"):
-        compare_visits(first, visit_of(looks))
+        compare_visits(*(visit_of(upper(some[::2])) for some in (first.looks, looks)))
     found = compare_visits(first, told(visit_of(looks)))
     teeth = {tooth.tooth: tooth for tooth in found.teeth}
     assert set(MOVED) <= set(teeth)
@@ -76,11 +81,3 @@ def test_what_brackets_cover_is_told_and_painted_over() -> None:
 def test_a_visit_without_braces_stays_as_it_is() -> None:
     visit = toy_visit("plain")
     assert told(visit) is visit
-
-
-def test_a_number_that_has_no_place_in_3d_is_left_out() -> None:
-    first, second = toy_visit("one"), toy_visit("two")
-    teeth = {n: points for n, points in first.teeth.items() if n != 15}
-    found = compare_visits(replace(first, teeth=teeth), second)
-    assert 15 not in {tooth.tooth for tooth in found.teeth}
-    assert 15 in found.missing
