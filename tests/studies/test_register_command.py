@@ -61,8 +61,11 @@ def written(
 
 
 def test_a_page_without_live_scenes_is_small_and_has_the_pictures(
-    workspaces: tuple[Path, Path], written: tuple[Path, Result], tmp_path: Path
-) -> None:
+    workspaces: tuple[Path, Path], written: tuple[Path, Result],
+    compared: list[comparing.Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert written[1].exit_code == 0, written[1].output
+    monkeypatch.setattr(comparing, "compare_visits", lambda first, second: compared[0])
     result = CliRunner().invoke(
         app, ["register", *map(str, workspaces), "-o", str(tmp_path), "--no-live"]
     )
@@ -149,8 +152,13 @@ def test_a_run_that_was_begun_anew_is_refused(tmp_path: Path) -> None:
 
 
 def test_photographs_that_both_visits_hold_are_named(
-    workspaces: tuple[Path, Path], tmp_path: Path
-) -> None:
+    workspaces: tuple[Path, Path], written: tuple[Path, Result],
+    compared: list[comparing.Comparison], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert written[1].exit_code == 0, written[1].output
+    monkeypatch.setattr(
+        comparing, "compare_visits", lambda a, b: replace(compared[0], first=a, second=b)
+    )
     visit = toy_visit("third", turn=2.0)
     mixed = replace(visit, looks=(toy_visit("first").looks[0], *visit.looks[1:]))
     for other, named in ((workspaces[0], "000, 001, 002, 003"), (tmp_path / "mixed", "000")):
