@@ -37,8 +37,13 @@ SUITE: dict[str, Any] = {
 
 
 @contextmanager
-def toy_benchmark(folder: Path) -> Iterator[Callable[..., Any]]:
-    """What writes a suite with some changes, runs it, and returns its results."""
+def toy_benchmark(folder: Path, charts: bool = False) -> Iterator[Callable[..., Any]]:
+    """What writes a suite with some changes, runs it, and returns its results.
+
+    Args:
+        folder: that everything is in.
+        charts: whether the report is written.
+    """
 
     def call(change: Callable[[dict[str, Any]], None] | None = None, **options: Any) -> Any:
         write_suite(folder, change)
@@ -50,6 +55,10 @@ def toy_benchmark(folder: Path) -> Iterator[Callable[..., Any]]:
         patch.setattr("pipeline.stage._entry_points", lambda: toy_bench.STAGES)
         patch.setattr("pipeline.studies.benchmark.running.WORKER", (*toy_bench.COMMAND, "worker"))
         patch.setenv("TOY_LOG", str(folder / "log.txt"))
+        if not charts:
+            patch.setattr(
+                "pipeline.studies.benchmark.running.benchmark_report", toy_bench.no_report
+            )
         get_stage.cache_clear()
         yield call
     get_stage.cache_clear()
@@ -67,7 +76,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     """The folder of a benchmark that has run, not to be changed, and its results."""
     folder = tmp_path_factory.mktemp("finished")
     make_case(folder)
-    with toy_benchmark(folder) as call:
+    with toy_benchmark(folder, charts=True) as call:
         return folder, call()
 
 
@@ -122,6 +131,7 @@ def test_what_is_written(finished: tuple[Path, dict[str, Any]]) -> None:
     folder, results = finished
     out = folder / "out"
     assert json.loads((out / "results.json").read_text()) == results
+    assert "<html" in (out / "report.html").read_text()
     text = (out / "tables.md").read_text()
     assert "Measured on a." in text and "The data differ" not in text  # no method of the paper's
     assert "test poses registered and then refined" in text
@@ -284,8 +294,10 @@ def test_another_benchmark_in_the_folder_is_refused(bench: Any, tmp_path: Path) 
 # -- the command line ------------------------------------------------------------------------------
 
 
-def command(folder: Path, out: str, *arguments: str) -> subprocess.Popen[str]:
+def command(folder: Path, out: str, *arguments: str, charts: bool = False) -> subprocess.Popen[str]:
     environment = {**os.environ, "TOY_LOG": str(folder / "log.txt")}
+    if charts:
+        environment["TOY_CHARTS"] = "yes"
     return subprocess.Popen(
         [*toy_bench.COMMAND, "benchmark", "suite.yaml", "-o", out, *arguments],
         cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -313,8 +325,9 @@ def test_exit_status_and_what_is_said(tmp_path: Path) -> None:
     write_suite(tmp_path, one_cell)
 
     def call(out: str, *how: str, status: int = 0) -> tuple[str, str]:
-        ended, said, told = end_of(command(tmp_path, out, *how))
+        ended, said, told = end_of(command(tmp_path, out, *how, charts=out == "usual" and not how))
         assert ended == status, told
+        assert (tmp_path / out / "report.html").exists() == (out == "usual")
         return said, told
 
     assert call("quiet", "-q") == ("", "")

@@ -1,11 +1,13 @@
 """Toy stages with the settings that benchmarks use, to test these without any geometry.
 
 ``python toy_bench.py benchmark ...`` is the command line on them, ``python toy_bench.py worker``
-the process of one cell. Every stage that computes adds a line to the file $TOY_LOG.
+the process of one cell. Every stage that computes adds a line to the file $TOY_LOG. Charts of the
+report, which take longer than all the rest, are drawn where $TOY_CHARTS says so.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -18,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 import toy
 from toy import Numbers, ToyEntryPoint
 
+import pipeline.runner
 import pipeline.stage
 from pipeline.artifacts import KINDS
 from pipeline.errors import ReconstructionError, RequestError
@@ -144,14 +147,26 @@ TOYS = (ViewsStage, InitStage, FitStage, ExportStage, EvaluateStage)
 STAGES = {stage.name: [ToyEntryPoint(stage)] for stage in TOYS}
 
 
+def no_report(results: dict[str, Any], out: Path) -> Path:
+    """In place of the benchmark's report, where nobody asks for it."""
+    return out / "report.html"
+
+
 def install() -> None:
     """Replace the registered stages of this process by the toys."""
-    from pipeline.studies.benchmark import running
-
     KINDS["numbers"] = "toy:Numbers"
     pipeline.stage._entry_points = lambda: STAGES  # type: ignore[assignment]
     pipeline.stage.get_stage.cache_clear()
+    pipeline.runner.one_blas_thread = contextlib.nullcontext  # they know no matrices
+
+
+def start_toys() -> None:
+    """Cells that this process starts are of toys, too."""
+    from pipeline.studies.benchmark import running
+
     running.WORKER = (*COMMAND, "worker")
+    if "TOY_CHARTS" not in os.environ:
+        running.benchmark_report = no_report
 
 
 if __name__ == "__main__":
@@ -165,4 +180,5 @@ if __name__ == "__main__":
     else:
         from pipeline.cli import main
 
+        start_toys()
         main()
