@@ -269,7 +269,7 @@ def test_without_a_limit_it_takes_the_memory_it_needs(
     from pipeline.studies.batch import task
 
     monkeypatch.setattr(task, "_memory", lambda: 1)  # what the worker was given
-    listed(tmp_path, a="fit.wait=1")
+    listed(tmp_path, a="fit.wait=0.3")
     assert run("cases.csv", memory=0)["a"]["state"] == "done"
 
 
