@@ -205,7 +205,7 @@ PHOTOS = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
 #: A whole run in a few seconds, with all files but film and page of the scene.
 HASTY = {
     "views.long_side": 256, "fit.iterations": 5, "export.mesh_resolution": 64,
-    "export.mesh_faces": 2000, "export.video": False,
+    "export.mesh_faces": 2000, "export.video": False, "init.dental.complete_depth": False,
 }  # fmt: skip
 
 
