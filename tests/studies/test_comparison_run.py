@@ -32,6 +32,7 @@ from tests.studies.report_page import text_of
 SETTINGS = {
     "views.long_side": 192, "init.cameras": str(SAMPLES / "transforms.json"), "fit.iterations": 20,
     "fit.light": "none", "threads": 2, "report": False, "init.dense.method": "sweep",
+    "teeth.method": "none",
 }  # fmt: skip
 PHOTOS = [SAMPLES / f"{name}.jpg" for name in ("right_buccal", "frontal", "left_buccal")]
 
@@ -67,7 +68,9 @@ def test_the_whole_comparison(workspace, model):
     fits = {row["start"]: row for row in found.figures["fits"]}
     assert len(fits) == 3 and not any("failure" in row for row in fits.values())
     assert {row["iterations"] for row in fits.values()} == {20}
-    # 17.8, 19.0 and 14.8 when this was written; COLMAP's few points start a fit worst
+    manifests = found.folder.rglob("teeth/*/manifest.json")
+    assert [json.loads(path.read_text())["config"]["method"] for path in manifests] == ["none"]
+    # 21.9, 22.0 and 17.9 when this was written; COLMAP's few points start a fit worst
     assert all(row["psnr"] > 13.5 for row in fits.values())
     assert min(fits, key=lambda start: fits[start]["psnr"]) == "COLMAP's cameras and points"
     ours = json.loads(next(workspace.glob("evaluate/*/metrics/metrics.json")).read_text())

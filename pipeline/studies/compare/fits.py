@@ -16,7 +16,7 @@ from pipeline.store import Result, Store
 from pipeline.workspace import read_request
 
 #: Stages of a run that a comparison repeats, in their order.
-REPEATED = ("views", "init", "align", "sap", "flow", "fit", "evaluate")
+REPEATED = ("views", "teeth", "init", "align", "sap", "flow", "fit", "evaluate")
 #: Those that only dense points have a use for.
 FOR_DENSE = ("align", "sap")
 
