@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import shutil
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 import pipeline
+from pipeline import cli
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
 PHOTOS = sorted(SAMPLES.glob("*.jpg"))
@@ -26,19 +29,33 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def call(workspace: Path, *arguments: str) -> tuple[int, str]:
+def call(workspace: Path, *arguments: str, apart: bool = False) -> tuple[int, str]:
     """Run the command line; returns exit status and the last paragraph on standard error.
 
     Afterwards the good result must still be there.
+
+    Args:
+        workspace: with the good result.
+        arguments: of `pipeline run`.
+        apart: in a process of its own, as a user does; else in this one, a second faster.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline.cli", "run", *arguments, "-w", str(workspace)],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert "Traceback" not in done.stderr
+    words = ["run", *arguments, "-w", str(workspace)]
+    if apart:
+        command = [sys.executable, "-m", "pipeline.cli", *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        status, told = done.returncode, done.stderr
+    else:
+        stderr = io.StringIO()
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(stderr):
+            patch.setattr(sys, "argv", ["pipeline", *words])
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+        assert isinstance(ended.value.code, int)
+        status, told = ended.value.code, stderr.getvalue()
+    assert "Traceback" not in told
     summary = pipeline.run(SAMPLES, workspace=workspace, stages=["views"])
     assert {stage.action for stage in summary.stages} == {"cached"}
-    return done.returncode, done.stderr.strip().rpartition("\n")[2]
+    return status, told.strip().rpartition("\n")[2]
 
 
 def two_and(folder: Path, name: str, content: bytes) -> Path:
@@ -98,7 +115,8 @@ def missing(folder: Path) -> Path:
 def test_unusable_photographs(
     workspace: Path, tmp_path: Path, make: Callable[[Path], Path], words: list[str]
 ) -> None:
-    status, paragraph = call(workspace, str(make(tmp_path)), "--stages", "views")
+    apart = make is one_image
+    status, paragraph = call(workspace, str(make(tmp_path)), "--stages", "views", apart=apart)
     assert status == 2, paragraph
     for word in words:
         assert word in paragraph
@@ -117,7 +135,7 @@ def test_unusable_photographs(
     ],
 )
 def test_wrong_request(workspace: Path, arguments: tuple[str, ...], words: list[str]) -> None:
-    status, paragraph = call(workspace, str(SAMPLES), *arguments)
+    status, paragraph = call(workspace, str(SAMPLES), *arguments, apart="--stages" in arguments)
     assert status == 2, paragraph
     for word in words:
         assert word in paragraph
@@ -129,7 +147,7 @@ def test_photographs_that_share_nothing(workspace: Path, tmp_path: Path) -> None
     for name in ("left.png", "front.png", "right.png"):
         noise = cv2.resize(random.integers(0, 255, (48, 64, 3), np.uint8), (512, 384))
         cv2.imwrite(str(tmp_path / name), noise)
-    status, paragraph = call(workspace, str(tmp_path))
+    status, paragraph = call(workspace, str(tmp_path), apart=True)
     assert status == 3, paragraph
     assert ".png" in paragraph and "photograph" in paragraph
 
