@@ -295,7 +295,7 @@ def page(written: tuple[Path, Result]) -> str:
 @needs_chromium
 def test_both_scenes_are_live_under_one_slider(page: str, tmp_path: Path) -> None:
     """On a desk, and then in a window as narrow as a telephone."""
-    found, log = run_in(page, PROBE, tmp_path, (1280, 900), coarse=True, framed=True)
+    found, log = run_in(page, PROBE, tmp_path, (1280, 560), coarse=True, framed=True)
     assert "failed" not in found, found
     assert log == []
     assert (found["wide"]["width"], found["narrow"]["width"]) == (1280, 390)
