@@ -155,12 +155,12 @@ def test_the_summary_keeps_up_with_cases_that_end_quickly(
 
     told = []
     monkeypatch.setattr(running, "run_case", quick)
-    monkeypatch.setattr(running, "SUMMARY", 0.5)
+    monkeypatch.setattr(running, "SUMMARY", 0.3)
     monkeypatch.setattr(running, "write_summary", lambda *given: told.append(given[-1]))
-    listed(tmp_path, **{f"c{number}": "" for number in range(30)})
+    listed(tmp_path, **{f"c{number}": "" for number in range(20)})
     run("cases.csv", jobs=1)
     assert len({text.partition(" done")[0] for text in told}) > 3
-    assert told[-1].startswith("30 done;")
+    assert told[-1].startswith("20 done;")
 
 
 def test_all_that_failed_is_tried_again_where_a_case_is_called_so(run: Any, tmp_path: Path) -> None:
