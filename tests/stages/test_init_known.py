@@ -1,6 +1,7 @@
 """Cameras and lengths that the user knows: read, matched to photographs, undistorted, used."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from pipeline.stage import LocalContext
 from stages.init.place import place_known
 from stages.init.scale import mm_per_unit
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
+from stages.init.sfm.matching.features import describe
 from stages.init.sfm.matching.two_view import Correspondences
 from stages.init.sfm.options import ClassicalOptions
 from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
@@ -33,6 +35,25 @@ from stages.init.write import place_in
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples" / "three_photos"
 TRUTH = json.loads((SAMPLES / "transforms.json").read_text())
+#: Depth for who doesn't look at it.
+COARSE = {"planes": 16, "max_planes": 16, "fill": False}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def described_once() -> Iterator[None]:
+    """Features of the same pictures are found once: most tests here are of the same photographs."""
+    kept = {}
+
+    def once(images, *options):
+        *said, _threads, _scratch = options
+        key = (*((image.shape, image.tobytes()) for image in images), *said)
+        if key not in kept:
+            kept[key] = describe(images, *options)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stages.init.sfm.reconstruct.describe", once)
+        yield
 
 
 def look_at(yaw, distance=4.0):
@@ -124,7 +145,8 @@ def test_the_scale_of_an_earlier_run_is_taken_over_as_it_was(tmp_path):
     assert said(dentalsplat_scale=scale.as_dict(), units="") == NO_SCALE
     assert said(dentalsplat_scale=scale.as_dict()) == scale
     for units, kept in (("mm", scale), ("arbitrary", NO_SCALE)):
-        assert run(tmp_path / units, file, units=units).result("cameras").scale == kept
+        context = run(tmp_path / units, file, units=units, dense=COARSE)
+        assert context.result("cameras").scale == kept
 
 
 def sample_name(frame):
@@ -165,7 +187,7 @@ def test_distortion_is_taken_out_of_the_image(model, parameters):
 
 def test_distorted_model_gives_undistorted_views(tmp_path):
     folder = colmap_model(tmp_path / "model", "SIMPLE_RADIAL", (-0.05,))
-    context = run(tmp_path / "out", folder, dense={"planes": 16, "max_planes": 16, "fill": False})
+    context = run(tmp_path / "out", folder, dense=COARSE)
     views = context.result("views")
     assert len(views) == 3 and context.figures["undistorted"] == 3
     assert any(

@@ -157,7 +157,7 @@ def test_init_makes_a_scene_of_exact_outlines(tmp_path: Path) -> None:
     photographed = case("normal")
     read = Teeth(tuple(photographed.dentitions()))
     inputs = {"views": photographed.views, "teeth": read}
-    config = InitConfig(method="dental", dental={"accept_doubtful": True})
+    config = InitConfig(method="dental", dental={"accept_doubtful": True, "chart_density": 5})
     context = LocalContext(config, tmp_path, inputs=inputs, threads=1)
     InitStage().run(context)
     check_scene(photographed, context.result("teeth"), context.result("cameras"))
