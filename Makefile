@@ -17,7 +17,7 @@ demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
 
 test: system chromium .venv/installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # What the pages' tests ask in Chromium, in Firefox and in WebKitGTK (Safari's engine) as well.
 browsers: system chromium .venv/installed-dev
@@ -97,10 +97,11 @@ chromium:
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-# Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons.
+# Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons;
+# of the large ones left out here little is ever imported.
 define install
 $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '$(1)'
-$(BIN)/python -m compileall -q -j 0 .venv/lib > /dev/null || true
+$(BIN)/python -m compileall -q -j 0 -x '/(tests|torch|sympy|plotly)/' .venv/lib > /dev/null || true
 endef
 
 .venv/installed: .venv/bin/python setup.cfg constraints.txt

@@ -27,8 +27,20 @@ SHORT = {
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
 
+#: Files that take a minute or half of it, for few tests: begun first (`--no-loadscope-reorder`), so
+#: that no process is left with one of them when the others are done.
+LONG = (
+    "test_benchmark_smoke", "test_teeth_mouths", "test_batch", "test_register_command",
+    "test_register", "test_splats_stage", "test_register_hardware", "test_viewer_steering",
+    "test_viewer_marks", "test_viewer_tools", "test_peers", "test_comparison_run",
+)  # fmt: skip
+
 # Tests start hundreds of processes: the first one compiles the modules, not each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 @pytest.fixture(scope="session", autouse=True)
