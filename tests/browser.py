@@ -90,7 +90,7 @@ def run_in(
         "--virtual-time-budget=30000", *["--force-device-scale-factor=0.5"] * coarse,
         address=address,
     )  # fmt: skip
-    found = re.search(r'<pre id="told">(.*?)</pre>', dom, re.S)
+    found = re.search(r'<pre id="what-the-script-told">(.*?)</pre>', dom, re.S)
     assert found, f"the script told nothing: {console(log)}"
     return json.loads(html.unescape(found[1])), console(log)
 
@@ -102,7 +102,7 @@ function tell(result) {
   const text = JSON.stringify(result);
   if (parent !== window) return parent.postMessage(text, "*");
   const shown = document.createElement("pre");
-  shown.id = "told";
+  shown.id = "what-the-script-told";
   shown.textContent = text;
   document.body.append(shown);
 }
@@ -122,7 +122,7 @@ addEventListener("message", (event) => {{
     return event.source.postMessage("resized", "*");
   }}
   const shown = document.createElement("pre");
-  shown.id = "told";
+  shown.id = "what-the-script-told";
   shown.textContent = event.data;
   document.body.append(shown);
 }});

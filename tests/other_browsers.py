@@ -29,8 +29,9 @@ PREFERENCES = {
     "browser.shell.checkDefaultBrowser": False, "datareporting.policy.dataSubmissionEnabled": False,
     "browser.aboutwelcome.enabled": False,
 }  # fmt: skip
+_PLACE = "document.getElementById('what-the-script-told')"
 #: What the page has told, once it has.
-TOLD = "document.getElementById('told') && document.getElementById('told').textContent"
+TOLD = f"{_PLACE} && {_PLACE}.textContent"
 
 
 def told_in(
