@@ -21,7 +21,6 @@ from tests.stages.mouth_case import CALM
 MM = Scale("mm", "length", 0.0)
 UP = np.array([0.0, 1.0, 0.0])
 SIZE = (480, 360)
-_GROWN: dict[int, Mouth] = {}
 
 
 @cache
@@ -30,18 +29,13 @@ def grown(seed: int, **options: object) -> Mouth:
 
 
 @cache
-def _photographed(mouth_id: int, angles: tuple[tuple[float, float], ...]):
-    return photographed(_GROWN[mouth_id], angles, SIZE)
+def seen(seed: int, angles: tuple[tuple[float, float], ...] = YAWS, **options: object):
+    """Photographs of a mouth, taken once."""
+    return photographed(grown(seed, **options), angles, SIZE)
 
 
-def seen(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS):
-    """Its photographs, taken once."""
-    _GROWN[id(mouth)] = mouth
-    return _photographed(id(mouth), angles)
-
-
-def measured(mouth: Mouth, angles: tuple[tuple[float, float], ...] = YAWS):
-    reading = read_landmarks(*seen(mouth, angles))
+def measured(seed: int, angles: tuple[tuple[float, float], ...] = YAWS, **options: object):
+    reading = read_landmarks(*seen(seed, angles, **options))
     return {entry["name"]: entry for entry in measure_mouth(reading, UP, MM)}
 
 
@@ -53,7 +47,7 @@ OPEN = {"overbite": -2.0, "bite": "open", "overjet": 1.5}
 )
 def test_what_is_measured_is_true_within_its_uncertainty(seed: int, options: dict) -> None:
     mouth = grown(seed, **options)
-    true, found = truth(mouth), measured(mouth)
+    true, found = truth(mouth), measured(seed, **options)
     assert set(found) == set(true)
     for name, entry in found.items():
         assert abs(entry["value"] - true[name]) <= entry["uncertainty"], (name, entry, true[name])
@@ -76,8 +70,9 @@ def test_a_covered_overbite_is_estimated_and_said_to_be(
     seed: int, crown_height: float, options: dict
 ) -> None:
     """Crowns a standard deviation taller and lower than the textbook's, and a receded gum."""
-    mouth = grown(seed, crown_height=crown_height, **options)
-    entry, true = measured(mouth)["overbite"], truth(mouth)["overbite"]
+    given = {"crown_height": crown_height, **options}
+    mouth = grown(seed, **given)
+    entry, true = measured(seed, **given)["overbite"], truth(mouth)["overbite"]
     assert abs(entry["value"] - true) <= entry["uncertainty"] < 3
     assert "cover the edges of the lower ones" in entry["estimated"]["because"]
     assert entry["method"].startswith("estimated, not measured")
@@ -93,7 +88,7 @@ def test_a_covered_overbite_is_estimated_and_said_to_be(
 
 def test_an_estimate_follows_the_bite_and_errs_with_the_crowns_height() -> None:
     def overbite(**options: object) -> float:
-        return measured(grown(8, **options))["overbite"]["value"]
+        return measured(8, **options)["overbite"]["value"]
 
     shallow, deep = overbite(overbite=1.0), overbite(overbite=4.0)
     assert deep - shallow == pytest.approx(3.0, abs=0.5)
@@ -101,7 +96,7 @@ def test_an_estimate_follows_the_bite_and_errs_with_the_crowns_height() -> None:
 
 
 def test_an_estimate_needs_no_scale() -> None:
-    reading = read_landmarks(*seen(grown(8, overbite=3.0)))
+    reading = read_landmarks(*seen(8, overbite=3.0))
     larger = replace(
         reading,
         landmarks={
@@ -130,7 +125,7 @@ def test_an_estimate_needs_no_scale() -> None:
 
 def test_an_overbite_is_less_sure_where_one_of_the_incisors_is_covered() -> None:
     """It is that of the others, and too small: the covered one reaches higher."""
-    reading = read_landmarks(*seen(grown(2, **OPEN)))
+    reading = read_landmarks(*seen(2, **OPEN))
     marks = {key: mark for key, mark in reading.landmarks.items() if key != ("tip", 31)}
     one = replace(reading, landmarks=marks, covered=reading.covered | {31})
     both, left = (
@@ -141,16 +136,16 @@ def test_an_overbite_is_less_sure_where_one_of_the_incisors_is_covered() -> None
 
 
 def test_what_can_not_be_estimated_either_says_why() -> None:
-    milk = measured(grown(9, dentition="primary", missing=(), overbite=2.0))["overbite"]
+    milk = measured(9, dentition="primary", missing=(), overbite=2.0)["overbite"]
     assert (milk["value"], milk["estimated"]) == (None, None)
     assert "cover the edges of the lower ones" in milk["not_visible"]
     assert "nor is it estimated where there are primary teeth" in milk["not_visible"]
 
-    reverse = measured(grown(10, bite="reverse", overbite=2.0, overjet=-2.5))["overbite"]
+    reverse = measured(10, bite="reverse", overbite=2.0, overjet=-2.5)["overbite"]
     assert reverse["value"] is None
     assert "estimated" not in reverse["not_visible"]
 
-    dentitions, cameras, depths = seen(grown(8, overbite=3.0))
+    dentitions, cameras, depths = seen(8, overbite=3.0)
     cut = [
         replace(d, lower=tuple(replace(c, doubtful=c.number in (31, 41)) for c in d.lower))
         for d in dentitions
@@ -162,8 +157,8 @@ def test_what_can_not_be_estimated_either_says_why() -> None:
 
 
 def test_sides_are_the_patients() -> None:
-    to_left = measured(grown(3, midline=2.5))["midline_shift"]
-    to_right = measured(grown(3, midline=-2.5))["midline_shift"]
+    to_left = measured(3, midline=2.5)["midline_shift"]
+    to_right = measured(3, midline=-2.5)["midline_shift"]
     assert to_left["direction"] == "lower midline to the patient's left"
     assert to_right["direction"] == "lower midline to the patient's right"
     assert to_left["value"] - to_right["value"] == pytest.approx(5.0, abs=1.0)
@@ -175,22 +170,22 @@ def test_a_shift_of_nothing_has_no_direction(monkeypatch: pytest.MonkeyPatch) ->
     for shift, said in ((0.02, ""), (0.049, ""), (0.05, to_left), (-0.08, to_right)):
         rule = replace(midline, measure=lambda places, axes, mm=shift: (mm, np.zeros((2, 3))))
         monkeypatch.setattr(measures, "RULES", (rule,))
-        assert measured(grown(3, midline=2.5))["midline_shift"]["direction"] == said
+        assert measured(3, midline=2.5)["midline_shift"]["direction"] == said
 
 
 def test_a_tooth_that_is_not_there_is_named() -> None:
-    found = measured(grown(4, missing=(13, 18, 28, 38, 48)))
+    found = measured(4, missing=(13, 18, 28, 38, 48))
     entry = found["intercanine_upper"]
     assert entry["value"] is None
     assert entry["not_visible"] == "no photograph shows 13 with depth"
     assert found["intercanine_lower"]["value"] is not None
     # a midline is that between two teeth
-    entry = measured(grown(4, missing=(21, 18, 28, 38, 48)))["midline_shift"]
+    entry = measured(4, missing=(21, 18, 28, 38, 48))["midline_shift"]
     assert entry["not_visible"] == "no photograph shows 21 with depth"
 
 
 def test_doubtful_numbers_give_nothing() -> None:
-    dentitions, cameras, depths = seen(grown(0))
+    dentitions, cameras, depths = seen(0)
     unsure = [replace(d, upper=tuple(replace(c, doubt=0.7) for c in d.upper)) for d in dentitions]
     found = {e["name"]: e for e in measure_mouth(read_landmarks(unsure, cameras, depths), UP, MM)}
     assert found["overjet"]["not_visible"] == "it is not sure which tooth is 11 or 21"
@@ -213,7 +208,7 @@ def test_the_axes_are_the_mouths_own() -> None:
 def test_the_upper_edges_that_a_scene_draws_too_long_make_no_reverse_bite(seed: int) -> None:
     """Beside the upper edges a scene may show their depth where the lower crowns are seen."""
     mouth = grown(seed, overjet=5.0)
-    dentitions, cameras, depths = seen(mouth)
+    dentitions, cameras, depths = seen(seed, overjet=5.0)
     drawn = []
     for dentition, depth in zip(dentitions, depths, strict=True):
         upper = filled(dentition.upper, dentition.size)
@@ -230,10 +225,10 @@ def test_the_upper_edges_that_a_scene_draws_too_long_make_no_reverse_bite(seed: 
 def test_the_midline_is_where_the_central_incisors_meet() -> None:
     """Photographs from the sides show another place, and count only where there is no other."""
     mouth = grown(3, midline=2.5)
-    assert measured(mouth)["midline_shift"]["value"] == pytest.approx(
+    assert measured(3, midline=2.5)["midline_shift"]["value"] == pytest.approx(
         truth(mouth)["midline_shift"], abs=0.4
     )
-    sides = measured(mouth, ((-42.0, 4.0), (40.0, 4.0)))["midline_shift"]
+    sides = measured(3, ((-42.0, 4.0), (40.0, 4.0)), midline=2.5)["midline_shift"]
     assert sides["value"] is None
     assert sides["not_visible"] == "no photograph from the front shows where 11 and 21 meet"
 

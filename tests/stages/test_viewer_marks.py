@@ -101,6 +101,9 @@ DRAWN = """(async () => {
   result.crosshair = [crosshair()];
   for (const element of [$("more"), canvas]) {
     element.focus();
+    if (!document.hasFocus()) {  // a window that nobody looks at is told of no focus
+      canvas.dispatchEvent(new Event(element === canvas ? "focus" : "blur"));
+    }
     result.crosshair.push(crosshair());
   }
   tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });

@@ -9,10 +9,6 @@ import pytest
 
 import pipeline
 
-#: What takes longest and says nothing of benchmarks: teeth of more than three photographs, depth
-#: that the teeth's places complete.
-LESS = {"teeth.most_views": 3, "init.dental.complete_depth": False}
-
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -21,7 +17,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(out: Path) -> dict[str, Any]:
-    return pipeline.benchmark("smoke", out=out, jobs=2, overrides=LESS)
+    return pipeline.benchmark("smoke", out=out, jobs=2)
 
 
 def test_every_cell_came_out(results: dict[str, Any]) -> None:
