@@ -12,7 +12,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
 from pipeline.geometry.normals import depth_normals
 from pipeline.geometry.order import nearest_views
-from pipeline.kernels import each, kernel, kernel_threads
+from pipeline.kernels import each, helper, kernel, kernel_threads
 from stages.stereo.consistency import camera_table, stacked
 
 Array = npt.NDArray[np.float32]
@@ -67,6 +67,25 @@ class FusedCloud:
         return len(self.positions)
 
 
+@helper
+def _weighted_median(values, weights, count, order):  # type: ignore[no-untyped-def]
+    """Which of the first `count` values it is; `order` becomes their order."""
+    total = np.float32(0)
+    for k in range(count):
+        total += weights[k]
+        place = k
+        while place > 0 and values[order[place - 1]] > values[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    running = np.float32(0)
+    for k in range(count):
+        running += weights[order[k]]
+        if running >= np.float32(0.5) * total or k == (count - 1) // 2:
+            return order[k]
+    return order[0]
+
+
 @kernel(nogil=True)
 def _fuse_row(  # type: ignore[no-untyped-def]
     y, index, others, depths, confidences, images, cameras, fill_confidence, relative, front,
@@ -78,6 +97,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
     colors = np.empty((views, 3), np.float32)
     lumas = np.empty(views, np.float32)
     weights = np.empty(views, np.float32)
+    order = np.empty(views, np.int64)
     for x in range(keep.shape[1]):
         z = np.float64(depths[index, y, x])
         own = confidences[index, y, x]
@@ -93,7 +113,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
         weights[0] = own - np.float32(1)
         for k in range(3):
             colors[0, k] = images[index, y, x, k]
-        lumas[0] = colors[0].sum()
+        lumas[0] = colors[0, 0] + colors[0, 1] + colors[0, 2]
         mass = np.float64(own) - 1
         mean = z * mass
         residual = 0.0
@@ -135,7 +155,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
             weights[agree] = other - np.float32(1)
             for k in range(3):
                 colors[agree, k] = images[v, i, j, k]
-            lumas[agree] = colors[agree].sum()
+            lumas[agree] = colors[agree, 0] + colors[agree, 1] + colors[agree, 2]
         if refuted > 0 and (refuted >= agree or is_fill):
             continue
         if explained and merge:
@@ -148,15 +168,7 @@ def _fuse_row(  # type: ignore[no-untyped-def]
         # Highlights move with the camera and are brighter than the surface: from the weighted
         # median by luma (the darker one of two), take the mean of all that look like it.
         count = agree + 1
-        order = np.argsort(lumas[:count])
-        half = np.float32(0.5) * weights[:count].sum()
-        running = np.float32(0)
-        chosen = order[0]
-        for k in range(count):
-            running += weights[order[k]]
-            if running >= half or k == (count - 1) // 2:
-                chosen = order[k]
-                break
+        chosen = _weighted_median(lumas, weights, count, order)
         total = np.float32(0)
         for k in range(count):
             if abs(lumas[k] - lumas[chosen]) <= _ALIKE:

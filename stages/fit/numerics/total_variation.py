@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import prange
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from pipeline.kernels import inlined, kernel
@@ -81,50 +82,6 @@ def _many_columns(  # type: ignore[no-untyped-def]
                 store_from(gradient, place, load_from(gradient, place) + total * weight)
 
 
-@inlined
-def _among(row, number):  # type: ignore[no-untyped-def]
-    found = False
-    for other in row:
-        found |= other == number
-    return found
-
-
-@kernel(parallel=True)
-def _both_ways(found: Integers):  # type: ignore[no-untyped-def]
-    """Who is among whose nearest, from both ends, in order: [E] neighbours, [N + 1] starts.
-
-    `found` [N, K] has the nearest of each; it may itself be among them.
-    """
-    number = len(found)
-    one_way = np.empty(found.shape, np.bool_)
-    for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            for k in range(found.shape[1]):
-                one_way[i, k] = not _among(found[found[i, k]], i)
-    degree = np.zeros(number, np.int32)
-    for i in range(number):
-        for k in range(found.shape[1]):
-            degree[i] += found[i, k] != i
-            degree[found[i, k]] += one_way[i, k]
-    starts = np.zeros(number + 1, np.int32)
-    starts[1:] = np.cumsum(degree)
-    neighbours = np.empty(starts[number], np.int32)
-    filled = starts[:number].copy()
-    for i in range(number):
-        for k in range(found.shape[1]):
-            other = found[i, k]
-            if other != i:
-                neighbours[filled[i]] = other
-                filled[i] += 1
-                if one_way[i, k]:
-                    neighbours[filled[other]] = i
-                    filled[other] += 1
-    for chunk in prange((number + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(number, (chunk + 1) * CHUNK)):
-            neighbours[starts[i] : starts[i + 1]].sort()
-    return neighbours, starts
-
-
 def connected(positions: Floats, count: int) -> tuple[Integers, Integers]:
     """Who is near whom: two Gaussians of which one is among the other's nearest, from both ends.
 
@@ -142,9 +99,12 @@ def connected(positions: Floats, count: int) -> tuple[Integers, Integers]:
     for start in range(0, number, QUERIES):  # what the tree returns is four times as large
         some = positions[start : start + QUERIES]
         found[start : start + QUERIES] = tree.query(some, k=count + 1, workers=threads)[1]
-    with KERNELS:
-        neighbours, starts = _both_ways(found)
-    return neighbours, starts
+    others = found != np.arange(number, dtype=np.int32)[:, None]
+    starts = np.concatenate([[0], np.cumsum(others.sum(axis=1))]).astype(np.int32)
+    one_way = csr_array((np.ones(starts[-1], bool), found[others], starts), (number, number))
+    one_way.sort_indices()
+    both = one_way + one_way.T.tocsr()
+    return both.indices, both.indptr
 
 
 class TotalVariation:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pipeline.geometry.rigid import nearest_rotation
 from pipeline.kernels import kernel
+from stages.init.dental.cameras.algebra import apply, clear, invert, multiply, multiply_transposed
 from stages.init.dental.cameras.kernels import CENTRE_UNIT, PER_ARCH, PER_VIEW
 
 Array = npt.NDArray[np.float64]
@@ -96,15 +97,17 @@ def unknowns_of(  # type: ignore[no-untyped-def]
 ):
     """Write the views' unknowns (those of `bundle`) of a similarity into x [7V + 9]."""
     scale = np.exp(log_scale)
+    turned, D = np.empty((3, 3)), np.empty((3, 3))
+    axis, place = np.empty(3), np.empty(3)
     for v in range(len(turns)):
-        turn = np.ascontiguousarray(turns[v])
         # exp([w]x) = (camera from arch) nominal^T.
-        D = turn @ rotation @ np.ascontiguousarray(nominal[v].T)
-        axis = np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-        sine = 0.5 * np.sqrt((axis**2).sum())
+        multiply(turns[v], rotation, turned)
+        multiply_transposed(turned, nominal[v], D)
+        axis[0], axis[1], axis[2] = D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]
+        sine = 0.5 * np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
         angle = np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1))
         factor = 0.5 if sine < 1e-9 else 0.5 * angle / sine
-        place = turn @ centre
+        apply(turns[v], centre, place)
         for a in range(3):
             x[PER_VIEW * v + a] = factor * axis[a] / angle_deviations[v, a]
             x[PER_VIEW * v + 3 + a] = (place[a] + scale * shifts[v, a]) / CENTRE_UNIT
@@ -120,12 +123,14 @@ def unknowns_of(  # type: ignore[no-untyped-def]
 )
 def tangents(log_scale, turns, shifts, jacobians, angle_deviations, T):  # type: ignore[no-untyped-def]
     """T [7V + 9, 16]: how the views' unknowns and the arch's follow similarity and arch."""
-    T[:] = 0
+    clear(T)
     views = len(turns)
     scale = np.exp(log_scale)
+    inverse, turned = np.empty((3, 3)), np.empty((3, 3))
     for v in range(views):
         # Turning the arch by w in the first camera's frame turns it by (turn w) in this one.
-        turned = np.linalg.solve(jacobians[v], np.ascontiguousarray(turns[v]))
+        invert(jacobians[v], inverse)
+        multiply(inverse, turns[v], turned)
         for a in range(3):
             for c in range(3):
                 T[PER_VIEW * v + a, c] = turned[a, c] / angle_deviations[v, a]

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.kernels import kernel
-from stages.init.dental.cameras.algebra import cross_matrix, rotation_and_jacobian
+from stages.init.dental.cameras.algebra import (
+    apply,
+    clear,
+    cross_matrix,
+    multiply,
+    multiply_transposed,
+    rotation_and_jacobian,
+)
 
 #: Unknowns per view, of the arch, and how strongly its parts vary (one standard deviation): stretch
 #: along each axis, shift of the lower jaw (mm), its extra stretch.
@@ -162,29 +169,31 @@ def add_matches(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Cost of dense matches: Sampson's distance (Hartley & Zisserman 11.4.3)."""
     cost = 0.0
-    F = np.empty((3, 3))
-    d_fundamental = np.zeros((14, 9))
+    R, E, F = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    dR, dE, rest = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    d_fundamental, chained = np.zeros((14, 9)), np.empty((14, 9))
     gradient = np.empty(9)
     normal = np.empty((9, 9))
     right = np.empty(9)
     spin = np.empty((3, 3))
     t_cross = np.empty((3, 3))
     d_t_cross = np.empty((3, 3))
-    unit = np.empty(3)
+    unit, t, dt = np.empty(3), np.empty(3), np.empty(3)
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
-        Ri, Rj = np.ascontiguousarray(rotations[i]), np.ascontiguousarray(rotations[j])
-        R = Rj @ np.ascontiguousarray(Ri.T)
+        multiply_transposed(rotations[j], rotations[i], R)
         # In the frame of the arch's centre: camera = R X + centre, so that t = c_j - R c_i.
-        t = centres[j] - R @ np.ascontiguousarray(centres[i])
+        apply(R, centres[i], t)
+        for a in range(3):
+            t[a] = centres[j, a] - t[a]
         cross_matrix(t, t_cross)
-        E = t_cross @ R
+        multiply(t_cross, R, E)
         scale_i, scale_j = 1 / lens[i], 1 / lens[j]
         for a in range(3):
             for c in range(3):
                 F[a, c] = E[a, c] * (scale_j if a < 2 else 1.0) * (scale_i if c < 2 else 1.0)
-        normal[:] = 0
-        right[:] = 0
+        clear(normal)
+        clear(right)
         weight = pair_weights[p]
         deviation = pair_deviations[p]
         for m in range(starts[p], starts[p + 1]):
@@ -220,30 +229,36 @@ def add_matches(  # type: ignore[no-untyped-def]
             continue
         for side in range(2):
             v = j if side else i
-            for k in range(PER_VIEW):
+            for k in range(6):
                 if k < 3:
                     for a in range(3):
                         unit[a] = jacobians[v, a, k] * angle_deviations[v, k]
                     cross_matrix(unit, spin)
-                    dR = spin @ R if side else -(R @ spin)
-                    dt = -(dR @ np.ascontiguousarray(centres[i]))
-                    cross_matrix(dt, d_t_cross)
-                    dE = d_t_cross @ R + t_cross @ dR
-                elif k < 6:
-                    unit[:] = 0
-                    unit[k - 3] = CENTRE_UNIT
-                    dt = unit.copy() if side else -(R @ unit)
-                    cross_matrix(dt, d_t_cross)
-                    dE = d_t_cross @ R
+                    if side:
+                        multiply(spin, R, dR)
+                    else:
+                        multiply_transposed(R, spin, dR)  # spin^T = -spin
+                    apply(dR, centres[i], dt)
+                    for a in range(3):
+                        dt[a] = -dt[a]
+                    multiply(t_cross, dR, rest)
                 else:
-                    dE = np.zeros((3, 3))
+                    clear(rest)
+                    for a in range(3):
+                        dt[a] = CENTRE_UNIT * (a == k - 3) if side else -CENTRE_UNIT * R[a, k - 3]
+                cross_matrix(dt, d_t_cross)
+                multiply(d_t_cross, R, dE)
                 for a in range(3):
                     for c in range(3):
-                        value = dE[a, c] * (scale_j if a < 2 else 1.0) * (scale_i if c < 2 else 1.0)
-                        if k == 6 and ((side == 1 and a < 2) or (side == 0 and c < 2)):
-                            value = -F[a, c] * focal_deviations[v]
+                        value = dE[a, c] + rest[a, c]
+                        value *= (scale_j if a < 2 else 1.0) * (scale_i if c < 2 else 1.0)
                         d_fundamental[PER_VIEW * side + k, 3 * a + c] = value
-        chained = d_fundamental @ normal
+            for a in range(3):
+                for c in range(3):
+                    scaled = a < 2 if side else c < 2  # by this view's focal length
+                    value = -F[a, c] * focal_deviations[v] if scaled else 0.0
+                    d_fundamental[PER_VIEW * side + 6, 3 * a + c] = value
+        multiply(d_fundamental, normal, chained)
         for k in range(14):
             row = PER_VIEW * (i if k < PER_VIEW else j) + k % PER_VIEW
             for c in range(9):

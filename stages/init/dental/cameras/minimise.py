@@ -11,9 +11,14 @@ import numpy as np
 from pipeline.kernels import helper, kernel
 from stages.init.dental.cameras.algebra import (
     cholesky,
+    clear,
+    copy_to,
     eliminate,
+    multiply,
     rotation_and_jacobian,
     solve_cholesky,
+    transposed_apply,
+    transposed_multiply,
 )
 from stages.init.dental.cameras.held import PER_SIMILARITY, tangents, unknowns_of
 from stages.init.dental.cameras.kernels import (
@@ -38,7 +43,11 @@ def _assess(  # type: ignore[no-untyped-def]
     """Cost at x and offsets; where `derive`, with the normal equations."""
     views = len(nominal)
     if derive:
-        H[:], b[:], H_own[:], b_own[:], H_cross[:] = 0, 0, 0, 0, 0
+        clear(H)
+        clear(b)
+        clear(H_own)
+        clear(b_own)
+        clear(H_cross)
     place_cameras(
         x, views, nominal, angle_deviations, distance, focals, focal_deviations,
         rotations, centres, lens, jacobians,
@@ -93,7 +102,8 @@ def minimise(  # type: ignore[no-untyped-def]
     H_own, b_own = np.zeros((count, 3, 3)), np.zeros((count, 3))
     H_cross, own_inverse = np.zeros((count, n, 3)), np.empty((count, 3, 3))
     free_H, free_b, free_cross = H, b, H_cross  # in what the steps are taken
-    T, small, small_jacobian, w = np.empty((n, m)), np.eye(3), np.eye(3), np.empty(3)
+    T, H_T, w = np.empty((n, m)), np.empty((n, m)), np.empty(3)
+    small, small_jacobian = np.empty((3, 3)), np.empty((3, 3))
     if held:
         free_H, free_b, free_cross = np.empty((m, m)), np.empty(m), np.empty((count, m, 3))
         unknowns_of(
@@ -101,7 +111,9 @@ def minimise(  # type: ignore[no-untyped-def]
         )
     L, s, step = np.zeros((m, m)), np.empty(m), np.empty(m)
     trial, trial_offsets = np.empty(n), np.empty((count, 3))
-    trial_rotation, trial_centre, trial_scale = rotation, centre, log_scale
+    trial_rotation, trial_centre, trial_scale = np.empty((3, 3)), np.empty(3), log_scale
+    copy_to(rotation, trial_rotation)
+    copy_to(centre, trial_centre)
     damping, cost, finished = 1e-3, 0.0, False
     for iteration in range(max_steps + 1):
         cost = _assess(
@@ -112,10 +124,11 @@ def minimise(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         if held:
             tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
-            free_H[:] = T.T @ (H @ T)
-            free_b[:] = T.T @ b
+            multiply(H, T, H_T)
+            transposed_multiply(T, H_T, free_H)
+            transposed_apply(T, b, free_b)
             for i in range(count):
-                free_cross[i] = T.T @ H_cross[i]
+                transposed_multiply(T, H_cross[i], free_cross[i])
         if finished or iteration == max_steps:
             break
         improved = False
@@ -139,9 +152,9 @@ def minimise(  # type: ignore[no-untyped-def]
             if held:
                 for a in range(3):
                     w[a] = -step[a]
+                    trial_centre[a] = centre[a] - CENTRE_UNIT * step[3 + a]
                 rotation_and_jacobian(w, small, small_jacobian)
-                trial_rotation = small @ rotation
-                trial_centre = centre - CENTRE_UNIT * step[3:6]
+                multiply(small, rotation, trial_rotation)
                 trial_scale = log_scale - step[6]
                 for k in range(PER_ARCH):
                     trial[PER_VIEW * views + k] = x[PER_VIEW * views + k] - step[PER_SIMILARITY + k]
@@ -162,8 +175,11 @@ def minimise(  # type: ignore[no-untyped-def]
             if new_cost < cost:
                 improved = True
                 finished = cost - new_cost < tolerance
-                x[:], offsets[:] = trial, trial_offsets
-                rotation[:], centre[:], log_scale = trial_rotation, trial_centre, trial_scale
+                copy_to(trial, x)
+                copy_to(trial_offsets, offsets)
+                copy_to(trial_rotation, rotation)
+                copy_to(trial_centre, centre)
+                log_scale = trial_scale
                 damping = max(damping * 0.2, 1e-7)
                 break
             damping = max(damping, 1e-5) * 8

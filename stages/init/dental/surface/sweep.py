@@ -13,9 +13,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
-from pipeline.kernels import helper, kernel
+from pipeline.kernels import each, helper, kernel
 from stages.init.dental.surface.carve import carved, in_void
 from stages.init.dental.surface.chart.grid import ChartGrid, normals_of
 from stages.init.dental.surface.fit import fit_offsets
@@ -117,65 +116,63 @@ def _box(values, radius, sums, out):  # type: ignore[no-untyped-def]
             out[i, j] = column[j] * scale
 
 
-@kernel(parallel=True, fastmath=True)
-def _volume(  # type: ignore[no-untyped-def]
-    points, normals, offsets, textures, sizes, cameras, pairs, seen, radius, neutral, floor, volume
-):
-    """One plane per task: sample every view, correlate every pair, average the pairs that see."""
+@kernel(fastmath=True, nogil=True)
+def _plane(  # type: ignore[no-untyped-def]
+    d, points, normals, offsets, textures, sizes, cameras, pairs, seen, radius, neutral, floor,
+    volume,
+):  # fmt: skip
+    """Plane d: sample every view, correlate every pair, average the pairs that see."""
     rows, cols = points.shape[:2]
     views = textures.shape[0]
-    for d in prange(offsets.shape[0]):
-        samples = np.zeros((views, rows, cols), np.float32)
-        means = np.zeros((views, rows, cols), np.float32)
-        spreads = np.zeros((views, rows, cols), np.float32)
-        product = np.zeros((rows, cols), np.float32)
-        sums = np.zeros((rows, cols), np.float32)
-        both = np.zeros((rows, cols), np.float32)
-        cost = np.zeros((rows, cols), np.float32)
-        count = np.zeros((rows, cols), np.float32)
-        for v in range(views):
-            c = cameras[v]
-            for i in range(rows):
-                for j in range(cols):
-                    X = points[i, j, 0] + offsets[d] * normals[i, j, 0]
-                    Y = points[i, j, 1] + offsets[d] * normals[i, j, 1]
-                    Z = points[i, j, 2] + offsets[d] * normals[i, j, 2]
-                    x = c[0] * X + c[1] * Y + c[2] * Z + c[9]
-                    y = c[3] * X + c[4] * Y + c[5] * Z + c[10]
-                    z = max(c[6] * X + c[7] * Y + c[8] * Z + c[11], np.float32(1))
-                    value = _bilinear(
-                        textures[v], sizes[v, 0], sizes[v, 1],
-                        c[12] * x / z + c[13], c[12] * y / z + c[14],
-                    )  # fmt: skip
-                    samples[v, i, j] = value
-                    product[i, j] = value * value
-            _box(samples[v], radius, sums, means[v])
-            _box(product, radius, sums, spreads[v])
-            for i in range(rows):
-                for j in range(cols):
-                    variance = spreads[v, i, j] - means[v, i, j] * means[v, i, j]
-                    spreads[v, i, j] = np.float32(1) / np.sqrt(max(variance, floor))
-        for p in range(pairs.shape[0]):
-            a, b = pairs[p, 0], pairs[p, 1]
-            for i in range(rows):
-                for j in range(cols):
-                    product[i, j] = samples[a, i, j] * samples[b, i, j]
-            _box(product, radius, sums, both)
-            for i in range(rows):
-                for j in range(cols):
-                    if seen[a, i, j] and seen[b, i, j]:
-                        covariance = both[i, j] - means[a, i, j] * means[b, i, j]
-                        cost[i, j] += (
-                            np.float32(1) - covariance * spreads[a, i, j] * spreads[b, i, j]
-                        )
-                        count[i, j] += np.float32(1)
+    samples = np.zeros((views, rows, cols), np.float32)
+    means = np.zeros((views, rows, cols), np.float32)
+    spreads = np.zeros((views, rows, cols), np.float32)
+    product = np.zeros((rows, cols), np.float32)
+    sums = np.zeros((rows, cols), np.float32)
+    both = np.zeros((rows, cols), np.float32)
+    cost = np.zeros((rows, cols), np.float32)
+    count = np.zeros((rows, cols), np.float32)
+    for v in range(views):
+        c = cameras[v]
         for i in range(rows):
             for j in range(cols):
-                if count[i, j] > 0:
-                    mean = cost[i, j] / count[i, j]
-                    volume[i, j, d] = min(max(mean, np.float32(0)), np.float32(1.4))
-                else:
-                    volume[i, j, d] = neutral
+                X = points[i, j, 0] + offsets[d] * normals[i, j, 0]
+                Y = points[i, j, 1] + offsets[d] * normals[i, j, 1]
+                Z = points[i, j, 2] + offsets[d] * normals[i, j, 2]
+                x = c[0] * X + c[1] * Y + c[2] * Z + c[9]
+                y = c[3] * X + c[4] * Y + c[5] * Z + c[10]
+                z = max(c[6] * X + c[7] * Y + c[8] * Z + c[11], np.float32(1))
+                value = _bilinear(
+                    textures[v], sizes[v, 0], sizes[v, 1],
+                    c[12] * x / z + c[13], c[12] * y / z + c[14],
+                )  # fmt: skip
+                samples[v, i, j] = value
+                product[i, j] = value * value
+        _box(samples[v], radius, sums, means[v])
+        _box(product, radius, sums, spreads[v])
+        for i in range(rows):
+            for j in range(cols):
+                variance = spreads[v, i, j] - means[v, i, j] * means[v, i, j]
+                spreads[v, i, j] = np.float32(1) / np.sqrt(max(variance, floor))
+    for p in range(pairs.shape[0]):
+        a, b = pairs[p, 0], pairs[p, 1]
+        for i in range(rows):
+            for j in range(cols):
+                product[i, j] = samples[a, i, j] * samples[b, i, j]
+        _box(product, radius, sums, both)
+        for i in range(rows):
+            for j in range(cols):
+                if seen[a, i, j] and seen[b, i, j]:
+                    covariance = both[i, j] - means[a, i, j] * means[b, i, j]
+                    cost[i, j] += np.float32(1) - covariance * spreads[a, i, j] * spreads[b, i, j]
+                    count[i, j] += np.float32(1)
+    for i in range(rows):
+        for j in range(cols):
+            if count[i, j] > 0:
+                mean = cost[i, j] / count[i, j]
+                volume[i, j, d] = min(max(mean, np.float32(0)), np.float32(1.4))
+            else:
+                volume[i, j, d] = neutral
 
 
 def choose_pairs(photos: list[Photo], middle: Array64, options: SurfaceOptions) -> list[list[int]]:
@@ -302,7 +299,8 @@ def matching_cost(
         views = sorted({view for pair in compared for view in pair})
         shown = [photos[view] for view in views]
         part = np.empty((len(points), right - left, len(offsets)), np.float32)
-        _volume(
+        each(
+            _plane, len(offsets),
             np.ascontiguousarray(points[:, left:right]),
             np.ascontiguousarray(normals[:, left:right]), offsets,
             stacked([photo.texture for photo in shown]),
