@@ -90,18 +90,20 @@ reader-tissue: .venv/installed-dev
 system:
 	@tools/system-packages required
 
-# Only the tests of the pages need a browser.
-chromium:
+# Only the tests of the pages need a browser. One apt at a time.
+chromium: | system
 	@tools/system-packages browser
 
-.venv/bin/python:
-	$(PYTHON) -m venv .venv
+# With the newest pip: the one that Python 3.11 brings takes twice as long to choose versions.
+.venv/bin/python: | system
+	$(PYTHON) -m venv --upgrade-deps .venv
 
 # Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons;
 # of the large ones left out here little is ever imported.
+RARELY := tests|pip|torch|torchgen|sympy|mpmath|plotly|mypy|mypyc|fontTools|pygments|IPython|jedi
 define install
 $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '$(1)'
-$(BIN)/python -m compileall -q -j 0 -x '/(tests|torch|sympy|plotly)/' .venv/lib > /dev/null || true
+$(BIN)/python -m compileall -q -j 0 -x '/($(RARELY))/' .venv/lib > /dev/null || true
 endef
 
 .venv/installed: .venv/bin/python setup.cfg constraints.txt
