@@ -99,10 +99,11 @@ chromium: | system
 	$(PYTHON) -m venv --upgrade-deps .venv
 
 # Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons;
-# of the large ones left out here little is ever imported.
+# of the large ones left out here little is ever imported. setuptools warns of every editable install.
 RARELY := tests|pip|torch|torchgen|sympy|mpmath|plotly|mypy|mypyc|fontTools|pygments|IPython|jedi
 define install
-$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '$(1)'
+PYTHONWARNINGS=ignore:Editable $(BIN)/python -m pip install --quiet --no-compile \
+    --constraint constraints.txt --editable '$(1)'
 $(BIN)/python -m compileall -q -j 0 -x '/($(RARELY))/' .venv/lib > /dev/null || true
 endef
 
