@@ -97,7 +97,12 @@ SMALL = """(async () => {
     return Math.min(left, top, innerWidth - right, innerHeight - bottom) > -1;
   };
   const buttons = [...$("bar").querySelectorAll("button, input")];
-  const reached = buttons.filter((button) => { button.focus(); return inside(button); });
+  const reached = buttons.filter((button) => {
+    button.focus();
+    // without a window in front, Firefox tells nobody of the focus, and WebKit gives a frame none
+    if (!document.hasFocus()) button.scrollIntoView({ block: "nearest", inline: "nearest" });
+    return inside(button);
+  });
   const bar = $("bar").getBoundingClientRect();
   press("h");
   const help = [$("help").scrollTop, inside(document.activeElement), inside($("help-title"))];
