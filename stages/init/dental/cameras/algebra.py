@@ -30,28 +30,6 @@ def multiply(A, B, out):  # type: ignore[no-untyped-def]
 
 
 @helper
-def transposed_multiply(A, B, out):  # type: ignore[no-untyped-def]
-    """out = A^T B."""
-    for i in range(A.shape[1]):
-        for j in range(B.shape[1]):
-            total = 0.0
-            for k in range(A.shape[0]):
-                total += A[k, i] * B[k, j]
-            out[i, j] = total
-
-
-@helper
-def multiply_transposed(A, B, out):  # type: ignore[no-untyped-def]
-    """out = A B^T."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[0]):
-            total = 0.0
-            for k in range(A.shape[1]):
-                total += A[i, k] * B[j, k]
-            out[i, j] = total
-
-
-@helper
 def apply(A, x, out):  # type: ignore[no-untyped-def]
     """out = A x."""
     for i in range(A.shape[0]):
@@ -59,16 +37,6 @@ def apply(A, x, out):  # type: ignore[no-untyped-def]
         for k in range(A.shape[1]):
             total += A[i, k] * x[k]
         out[i] = total
-
-
-@helper
-def transposed_apply(A, x, out):  # type: ignore[no-untyped-def]
-    """out = A^T x."""
-    for j in range(A.shape[1]):
-        total = 0.0
-        for k in range(A.shape[0]):
-            total += A[k, j] * x[k]
-        out[j] = total
 
 
 @helper

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipeline.geometry.rigid import nearest_rotation
 from pipeline.kernels import kernel
-from stages.init.dental.cameras.algebra import apply, clear, invert, multiply, multiply_transposed
+from stages.init.dental.cameras.algebra import apply, clear, invert, multiply
 from stages.init.dental.cameras.kernels import CENTRE_UNIT, PER_ARCH, PER_VIEW
 
 Array = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ def unknowns_of(  # type: ignore[no-untyped-def]
     for v in range(len(turns)):
         # exp([w]x) = (camera from arch) nominal^T.
         multiply(turns[v], rotation, turned)
-        multiply_transposed(turned, nominal[v], D)
+        multiply(turned, nominal[v].T, D)
         axis[0], axis[1], axis[2] = D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]
         sine = 0.5 * np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
         angle = np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1))

@@ -10,7 +10,6 @@ from stages.init.dental.cameras.algebra import (
     clear,
     cross_matrix,
     multiply,
-    multiply_transposed,
     rotation_and_jacobian,
 )
 
@@ -181,7 +180,7 @@ def add_matches(  # type: ignore[no-untyped-def]
     unit, t, dt = np.empty(3), np.empty(3), np.empty(3)
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
-        multiply_transposed(rotations[j], rotations[i], R)
+        multiply(rotations[j], rotations[i].T, R)
         # In the frame of the arch's centre: camera = R X + centre, so that t = c_j - R c_i.
         apply(R, centres[i], t)
         for a in range(3):
@@ -237,7 +236,7 @@ def add_matches(  # type: ignore[no-untyped-def]
                     if side:
                         multiply(spin, R, dR)
                     else:
-                        multiply_transposed(R, spin, dR)  # spin^T = -spin
+                        multiply(R, spin.T, dR)  # spin^T = -spin
                     apply(dR, centres[i], dt)
                     for a in range(3):
                         dt[a] = -dt[a]

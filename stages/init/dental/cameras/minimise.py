@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.kernels import helper, kernel
 from stages.init.dental.cameras.algebra import (
+    apply,
     cholesky,
     clear,
     copy_to,
@@ -17,8 +18,6 @@ from stages.init.dental.cameras.algebra import (
     multiply,
     rotation_and_jacobian,
     solve_cholesky,
-    transposed_apply,
-    transposed_multiply,
 )
 from stages.init.dental.cameras.held import PER_SIMILARITY, tangents, unknowns_of
 from stages.init.dental.cameras.kernels import (
@@ -125,10 +124,10 @@ def minimise(  # type: ignore[no-untyped-def]
         if held:
             tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
             multiply(H, T, H_T)
-            transposed_multiply(T, H_T, free_H)
-            transposed_apply(T, b, free_b)
+            multiply(T.T, H_T, free_H)
+            apply(T.T, b, free_b)
             for i in range(count):
-                transposed_multiply(T, H_cross[i], free_cross[i])
+                multiply(T.T, H_cross[i], free_cross[i])
         if finished or iteration == max_steps:
             break
         improved = False
