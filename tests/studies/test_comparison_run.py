@@ -20,6 +20,7 @@ from pipeline.running.reporter import Reporter
 from pipeline.stage import LocalContext
 from pipeline.store import Store
 from pipeline.studies.compare.compare import compare
+from pipeline.studies.compare.fits import settings_of
 from pipeline.studies.compare.tables import markdown, tables_of
 from stages.align.stage import AlignStage
 from stages.init.config import InitConfig
@@ -89,6 +90,21 @@ def test_the_whole_comparison(workspace, model):
     assert "COLMAP, given model 3/3 1 (3)" in report
     assert "COLMAP's cameras and points 3 20" in report
     assert "it tells of earlier results" not in report
+
+
+def test_what_was_put_right_about_the_teeth_holds_in_its_fits_too(workspace, tmp_path):
+    store = Store(workspace)
+    results = {name: store.current(name) for name in ("views", "teeth", "init", "fit")}
+    settings = settings_of(workspace, results)
+    assert (settings["init.dental"]["labels"], settings["fit.iterations"]) == ([], 20)
+    (tmp_path / "teeth.yaml").write_text("photographs: {frontal: {kind: front}}")
+    corrected = settings_of(tmp_path, results)
+    labels = {**settings["init.dental"], "labels": str(tmp_path / "teeth.yaml")}
+    assert corrected == settings | {"init.dental": labels}
+    stages = ["views", "teeth", "init"]
+    done = pipeline.run(PHOTOS, workspace=tmp_path / "w", overrides=corrected, stages=stages)
+    init = done.stages[-1].folder
+    assert init and "teeth.yaml" in (init / "manifest.json").read_text()
 
 
 def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_path):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.artifacts.dental.corrections import corrections_file
 from pipeline.artifacts.metrics import Metrics
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
@@ -29,7 +30,8 @@ def fit_rows(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Score the fit of a workspace, and the same fit from COLMAP's cameras, and from its points.
 
-    The settings of every stage are those that the results in use were made with.
+    The settings of every stage are those that the results in use were made with, and what a person
+    put right about the teeth holds.
 
     Args:
         workspace: with a finished run up to `evaluate`.
@@ -53,7 +55,7 @@ def fit_rows(
             row["failure"] = why_not
         else:
             message(f"fit from {title}")
-            changes = settings_of(results) | {
+            changes = settings_of(workspace, results) | {
                 "init.method": "auto", "init.cameras": str(model.resolve()), "init.points": points,
                 "threads": threads, "report": False,
             }  # fmt: skip
@@ -64,8 +66,8 @@ def fit_rows(
     return rows
 
 
-def settings_of(results: Mapping[str, Result | None]) -> dict[str, Any]:
-    """The settings that results were made with, as overrides of a run.
+def settings_of(workspace: Path, results: Mapping[str, Result | None]) -> dict[str, Any]:
+    """The settings that results were made with, as overrides of a run in another workspace.
 
     A setting that this version no longer has is left out.
     """
@@ -77,6 +79,10 @@ def settings_of(results: Mapping[str, Result | None]) -> dict[str, Any]:
             for field, value in result.manifest["config"].items():
                 if field in known:
                     changes[f"{name}.{field}"] = value
+    dental = changes.get("init.dental", {})
+    said = corrections_file(dental.get("labels"), {"workspace": workspace}, "init.dental.labels")
+    if said:
+        changes["init.dental"] = {**dental, "labels": str(said)}
     return changes
 
 
