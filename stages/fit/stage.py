@@ -73,6 +73,14 @@ class FitStage(Stage):
         pixels = max(view.image.shape[0] * view.image.shape[1] for view in placed)
         settings = resolve(context.config, len(placed), context.seed, held, pixels)
 
+        first, last = settings.densify_from_iter, settings.densify_until_iter
+        if context.config.densify is True and first > last:
+            context.warn(
+                f"fit.densify is on and comes to nothing: it would begin at iteration {first} "
+                f"(fit.densify_from_iter) and end at {last} (fit.densify_until_iter) of "
+                f"{settings.iterations}. Give the fit more iterations, or let it begin earlier."
+            )
+
         def report(done: int, of: int, loss: float, psnr: float, gaussians: int) -> None:
             figures = {"loss": round(loss, 5), "psnr": round(psnr, 2), "gaussians": gaussians}
             context.progress("fit", done, of, **figures)

@@ -86,12 +86,18 @@ def fitted(tmp_path, **config):
 
 
 def test_a_card_that_agrees_is_used(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = fitted(tmp_path / "cpu", backend="cpu", densify=True, densify_from_iter=10)
+    grows = {
+        "densify": True, "densify_from_iter": 10, "densify_until_iter": 30,
+        "densification_interval": 10, "densify_abs_grad_threshold": 1e-6,
+    }  # fmt: skip
+    plain = fitted(tmp_path / "cpu", backend="cpu", **grows)
     assert plain.figures["backend"] == "cpu"
+    assert plain.figures["gaussians"] > 2000  # of 1500
     give_card(monkeypatch, STAND_IN)
-    card = fitted(tmp_path / "card", densify=True, densify_from_iter=10)
+    card = fitted(tmp_path / "card", **grows)
     assert card.figures["backend"] == "gsplat"
     assert card.figures["train_psnr"] == pytest.approx(plain.figures["train_psnr"], abs=0.1)
+    assert card.figures["gaussians"] == pytest.approx(plain.figures["gaussians"], rel=0.02)
 
 
 def test_short_fits_are_left_to_the_processor(tmp_path, monkeypatch) -> None:

@@ -81,6 +81,19 @@ def test_opacities_that_start_anew_are_no_divergence_and_have_time_to_come_back(
     assert here.figures["train_psnr"] > 30  # 33.3; 36.1 without
 
 
+def test_densification_that_comes_to_nothing_is_said(tmp_path) -> None:
+    views, cameras, points = case()
+    said = {}
+    for densify in (True, "auto"):
+        here = context(
+            tmp_path / str(densify), views, cameras, points, iterations=2, densify=densify
+        )
+        FitStage().run(here)
+        said[densify] = " ".join(here.warnings)
+    assert "begin at iteration 150 (fit.densify_from_iter) and end at 0" in said[True]
+    assert "densify" not in said["auto"]
+
+
 def test_a_stopped_fit_resumes_to_the_same_bytes_with_any_number_of_threads(tmp_path) -> None:
     views, cameras, points = case()
     config = {"densify": True, "densify_from_iter": 20, "densification_interval": 10,
