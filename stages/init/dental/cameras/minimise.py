@@ -114,12 +114,14 @@ def minimise(  # type: ignore[no-untyped-def]
     copy_to(rotation, trial_rotation)
     copy_to(centre, trial_centre)
     damping, cost, finished = 1e-3, 0.0, False
+    derive = np.bool_(True)  # a literal would have `_assess` compiled for each of both
     for iteration in range(max_steps + 1):
         cost = _assess(
             x, offsets, view_of, landmark_of, pixels, deviations, template, lower,
             offset_deviation, nominal, angle_deviations, distance, distance_deviation,
             own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
-            pair_deviations, rotations, centres, lens, jacobians, True, H, b, H_own, b_own, H_cross,
+            pair_deviations, rotations, centres, lens, jacobians, derive, H, b, H_own, b_own,
+            H_cross,
         )  # fmt: skip
         if held:
             tangents(log_scale, turns, shifts, jacobians, angle_deviations, T)
@@ -168,8 +170,8 @@ def minimise(  # type: ignore[no-untyped-def]
                 trial, trial_offsets, view_of, landmark_of, pixels, deviations, template, lower,
                 offset_deviation, nominal, angle_deviations, distance, distance_deviation,
                 own_deviation, focals, focal_deviations, pairs, starts, matches, pair_weights,
-                pair_deviations, rotations, centres, lens, jacobians, False, H, b, H_own, b_own,
-                H_cross,
+                pair_deviations, rotations, centres, lens, jacobians, not derive, H, b, H_own,
+                b_own, H_cross,
             )  # fmt: skip
             if new_cost < cost:
                 improved = True
