@@ -88,8 +88,8 @@ def run(out: Path, views: int, dentition: str, seed: int) -> dict[str, Any] | No
     make_photographs(photographs, seed, views, dentition)
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     subprocess.run(
-        ["pipeline", "run", str(photographs), "-w", str(workspace), "-q", *settings], check=False,
-        stderr=subprocess.DEVNULL,
+        [sys.executable, "-m", "dentalsplat", "run", str(photographs), "-w", str(workspace), "-q",
+         *settings], check=False, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     file = workspace / "results" / "teeth.json"
     if not file.exists():
