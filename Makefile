@@ -16,7 +16,9 @@ KILLS ?= 30
 demo: system .venv/installed
 	$(BIN)/pipeline run data_samples/three_photos -w runs/demo
 
+# Kernels first, on all cores: in the tests one process would wait for another that compiles.
 test: system chromium .venv/installed-dev
+	$(BIN)/pipeline warmup
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # What the pages' tests ask in Chromium, in Firefox and in WebKitGTK (Safari's engine) as well.
