@@ -80,8 +80,8 @@ def settings_of(workspace: Path, results: Mapping[str, Result | None]) -> dict[s
                 if field in known:
                     changes[f"{name}.{field}"] = value
     dental = changes.get("init.dental", {})
-    said = corrections_file(dental.get("labels"), {"workspace": workspace}, "init.dental.labels")
-    if said:
+    said = corrections_file(None, {"workspace": workspace})
+    if said and not dental.get("labels"):  # which goes before it
         changes["init.dental"] = {**dental, "labels": str(said)}
     return changes
 
