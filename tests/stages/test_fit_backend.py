@@ -86,9 +86,11 @@ def fitted(tmp_path, **config):
 
 
 def test_a_card_that_agrees_is_used(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # all that is seen is split: which gradients are above a threshold hangs on the last digit, and
+    # all lots that are drawn afterwards hang on that
     grows = {
         "densify": True, "densify_from_iter": 10, "densify_until_iter": 30,
-        "densification_interval": 10, "densify_abs_grad_threshold": 1e-6,
+        "densification_interval": 10, "densify_abs_grad_threshold": 1e-12,
     }  # fmt: skip
     plain = fitted(tmp_path / "cpu", backend="cpu", **grows)
     assert plain.figures["backend"] == "cpu"

@@ -35,7 +35,7 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def select(self, index: Bools) -> Cloud:
+    def select(self, index: Bools | Indices) -> Cloud:
         return Cloud(
             self.positions[index], self.colors[index], self.normals[index], self.weight[index]
         )

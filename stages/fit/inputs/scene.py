@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.flow import Flow
@@ -79,7 +80,7 @@ class Scene:
         return max(EXTENT_MARGIN * float(distance.max()), MIN_EXTENT), int(distance.argmin())
 
     def start(self, settings: FitSettings) -> Cloud:
-        """The points that become Gaussians: measured ones first, a limited share filled in."""
+        """The points that become Gaussians, measured ones and a limited share filled in."""
         trusted, fill = self.cloud.select(self.trusted), self.cloud.select(~self.trusted)
         count = settings.initial_points
         # however large a share is allowed, what was measured keeps its own
@@ -87,12 +88,14 @@ class Scene:
         fill = thin(fill, room) if room else fill.select(np.zeros(len(fill), bool))
         measured = thin(trusted, count - len(fill))
         measured = smooth_normals(measured, settings.normal_neighbours)
-        return Cloud(
+        cloud = Cloud(
             *(
                 np.concatenate([getattr(measured, name), getattr(fill, name)])
                 for name in ("positions", "colors", "normals", "weight")
             )
         )
+        # neighbours side by side: what is looked up for one is still in the cache for the next
+        return cloud.select(cKDTree(cloud.positions).indices) if len(cloud) else cloud
 
     def reduced(self, factor: int) -> Scene:
         """With images that are already small."""

@@ -40,7 +40,8 @@ def divide(packed: Floats, axes: Bools) -> tuple[Floats, Indices, Bools]:
         axes: [N, 3].
 
     Returns:
-        The new matrix, for each of its rows the old row that it came from, and whether it is new.
+        The new matrix, for each of its rows the old row that it came from, and whether it is new;
+        in the order of the old rows, so that what lay side by side still does.
     """
     source = np.arange(len(packed), dtype=np.int64)
     offsets = np.zeros((len(packed), 3), np.float32)
@@ -55,7 +56,9 @@ def divide(packed: Floats, axes: Bools) -> tuple[Floats, Indices, Bools]:
     moved = offsets * np.exp(result[:, 7:10])
     result[:, :3] += np.einsum("nij,nj->ni", rotations(result[:, 3:7]), moved)
     result[:, 7:10] += np.log(np.float32(SHRINK)) * axes[source]
-    return np.ascontiguousarray(result), source, np.asarray(axes[source].any(1))
+    order = np.argsort(source, kind="stable")
+    source = source[order]
+    return result[order], source, np.asarray(axes[source].any(1))
 
 
 def fine(image: Floats, mask: Floats) -> Floats:
