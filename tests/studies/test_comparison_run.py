@@ -20,7 +20,7 @@ from pipeline.running.reporter import Reporter
 from pipeline.stage import LocalContext
 from pipeline.store import Store
 from pipeline.studies.compare.compare import compare
-from pipeline.studies.compare.fits import settings_of
+from pipeline.studies.compare.fits import settings_of, take_corrections
 from pipeline.studies.compare.tables import markdown, tables_of
 from stages.align.stage import AlignStage
 from stages.init.config import InitConfig
@@ -42,6 +42,8 @@ PHOTOS = [SAMPLES / f"{name}.jpg" for name in ("right_buccal", "frontal", "left_
 def workspace(tmp_path_factory):
     home = tmp_path_factory.mktemp("compare") / "w"
     stages = ["views", "init", "align", "sap", "fit", "evaluate"]
+    home.mkdir()
+    (home / "teeth.yaml").write_text("photographs: {frontal: {kind: front}}")
     pipeline.run(PHOTOS, workspace=home, overrides=SETTINGS, stages=stages)
     return home
 
@@ -71,6 +73,9 @@ def test_the_whole_comparison(workspace, model):
     assert {row["iterations"] for row in fits.values()} == {20}
     manifests = found.folder.rglob("teeth/*/manifest.json")
     assert [json.loads(path.read_text())["config"]["method"] for path in manifests] == ["none"]
+    manifests = [json.loads(k.read_text()) for k in found.folder.rglob("init/*/manifest.json")]
+    assert len(manifests) == 2
+    assert all("teeth.yaml" in dict(made["key_material"]["sources"]) for made in manifests)
     # 21.9, 22.0 and 17.9 when this was written; COLMAP's few points start a fit worst
     assert all(row["psnr"] > 13.5 for row in fits.values())
     assert min(fits, key=lambda start: fits[start]["psnr"]) == "COLMAP's cameras and points"
@@ -93,18 +98,22 @@ def test_the_whole_comparison(workspace, model):
 
 
 def test_what_was_put_right_about_the_teeth_holds_in_its_fits_too(workspace, tmp_path):
-    store = Store(workspace)
-    results = {name: store.current(name) for name in ("views", "teeth", "init", "fit")}
-    settings = settings_of(workspace, results)
+    settings = settings_of({name: Store(workspace).current(name) for name in ("init", "fit")})
     assert (settings["init.dental"]["labels"], settings["fit.iterations"]) == ([], 20)
     (tmp_path / "teeth.yaml").write_text("photographs: {frontal: {kind: front}}")
-    corrected = settings_of(tmp_path, results)
-    labels = {**settings["init.dental"], "labels": str(tmp_path / "teeth.yaml")}
-    assert corrected == settings | {"init.dental": labels}
-    stages = ["views", "teeth", "init"]
-    done = pipeline.run(PHOTOS, workspace=tmp_path / "w", overrides=corrected, stages=stages)
-    init = done.stages[-1].folder
-    assert init and "teeth.yaml" in (init / "manifest.json").read_text()
+    fits = tmp_path / "compare" / "colmap"
+    take_corrections(tmp_path, fits)
+    # a list of teeth in the settings does not go before it
+    listed = [{"photo": "frontal.jpg", "x": 96, "y": 60, "tooth": 11}]
+    config = InitConfig.model_validate({"dental": {"labels": listed}})
+    found = InitStage().sources(config, {"workspace": str(fits)})["teeth.yaml"]
+    assert found.read_bytes() == (tmp_path / "teeth.yaml").read_bytes()
+    (tmp_path / "teeth.yaml").write_text("photographs: {frontal: {kind: above}}")
+    with pytest.raises(RequestError, match=r"kind must be front, right or left"):
+        take_corrections(tmp_path, fits)
+    (tmp_path / "teeth.yaml").unlink()
+    take_corrections(tmp_path, fits)
+    assert not (fits / "teeth.yaml").exists()
 
 
 def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_path):

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
-from pipeline.artifacts.dental.corrections import corrections_file
+from pipeline.artifacts.dental.corrections import (
+    CORRECTIONS,
+    corrections_file,
+    read_corrections,
+)
 from pipeline.artifacts.metrics import Metrics
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
@@ -55,7 +60,7 @@ def fit_rows(
             row["failure"] = why_not
         else:
             message(f"fit from {title}")
-            changes = settings_of(workspace, results) | {
+            changes = settings_of(results) | {
                 "init.method": "auto", "init.cameras": str(model.resolve()), "init.points": points,
                 "threads": threads, "report": False,
             }  # fmt: skip
@@ -66,7 +71,7 @@ def fit_rows(
     return rows
 
 
-def settings_of(workspace: Path, results: Mapping[str, Result | None]) -> dict[str, Any]:
+def settings_of(results: Mapping[str, Result | None]) -> dict[str, Any]:
     """The settings that results were made with, as overrides of a run in another workspace.
 
     A setting that this version no longer has is left out.
@@ -79,11 +84,22 @@ def settings_of(workspace: Path, results: Mapping[str, Result | None]) -> dict[s
             for field, value in result.manifest["config"].items():
                 if field in known:
                     changes[f"{name}.{field}"] = value
-    dental = changes.get("init.dental", {})
-    said = corrections_file(None, {"workspace": workspace})
-    if said and not dental.get("labels"):  # which goes before it
-        changes["init.dental"] = {**dental, "labels": str(said)}
     return changes
+
+
+def take_corrections(workspace: Path, folder: Path) -> None:
+    """Give another workspace the `teeth.yaml` of one, or none where that has none.
+
+    Raises:
+        RequestError: it can't be read, or says something that isn't understood.
+    """
+    said = corrections_file(None, {"workspace": workspace})
+    if said is None:
+        (folder / CORRECTIONS).unlink(missing_ok=True)
+        return
+    read_corrections(said)
+    folder.mkdir(parents=True, exist_ok=True)
+    copyfile(said, folder / CORRECTIONS)
 
 
 def _row_in_use(results: Mapping[str, Result | None]) -> dict[str, Any]:
@@ -106,6 +122,7 @@ def _run(
     reporter: Reporter | None,
 ) -> dict[str, Any]:  # fmt: skip
     try:
+        take_corrections(workspace, folder)
         done = run(
             read_request(workspace)["images"], workspace=folder, overrides=changes, stages=stages,
             reporter=reporter,
