@@ -10,14 +10,38 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.gaussians import Gaussians
+from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply
 from pipeline.artifacts.space.frames import BACKGROUND, TURNED
+from pipeline.errors import RequestError
+from stages.splats import compressed
 from stages.splatting.frame import move_gaussians
 
 #: Bytes of a `.ply` that its header fits into.
 HEADER = 1 << 14
+#: Logit of an opacity that is 1 in float32; its negative is that of one that no picture shows.
+WHOLE = 20.0
 #: Natural logarithm of a standard deviation above which its square is not far from overflowing.
 LARGEST_LOG_SCALE = 40.0
+
+
+def read_splats(path: Path) -> Gaussians:
+    """Gaussians of a `.ply` as 3DGS or as PlayCanvas (compressed) writes it.
+
+    Opacities of 0 and 1, whose logits are infinite, get finite ones that render the same.
+
+    Raises:
+        RequestError: it is neither, or damaged.
+    """
+    with path.open("rb") as file:
+        if file.read(3) != b"ply":
+            raise RequestError(
+                f"{path} is no .ply. Of our own results give splats.ply or splats.compressed.ply; "
+                "splat-transform makes a .ply of .sog, .spz, .splat and .ksplat."
+            )
+    packed = f" {compressed.MARK}".encode("ascii") in _head(path)
+    fields = compressed.read_compressed_ply(path) if packed else read_gaussians_ply(path)
+    fields["logit_opacities"] = np.clip(fields["logit_opacities"], -WHOLE, WHOLE)
+    return Gaussians(**fields, light=None, background=said_background(path))
 
 
 def unusable(gaussians: Gaussians) -> npt.NDArray[np.bool_]:

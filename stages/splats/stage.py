@@ -7,6 +7,7 @@ Beside a finished run: ``pipeline run -w WORKSPACE --stages splats,evaluate`` wi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -36,7 +37,7 @@ class SplatsConfig(StageConfig):
     file: GivenPath | None = runtime(
         None,
         description="Gaussians of another program: a .ply as 3DGS, gsplat, nerfstudio, OpenSplat "
-        "and Brush write it. Its contents count, not its place.",
+        "and Brush write it, or PlayCanvas's compressed one. Its contents count, not its place.",
     )
     frame: Wanted = Field(
         "auto", description=f"frame that the file is in, as export.frame: {WANTED}"
@@ -54,10 +55,10 @@ class SplatsConfig(StageConfig):
 
 
 class SplatsStage(Stage):
-    """A 3DGS `.ply` -> Gaussians in our world."""
+    """A `.ply` of Gaussians -> Gaussians in our world."""
 
     name: ClassVar[str] = "splats"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     summary: ClassVar[str] = "take Gaussians that another program fitted (3DGS .ply)"
     Config: ClassVar[type[StageConfig]] = SplatsConfig
     requires: ClassVar[tuple[str, ...]] = ("cameras",)
@@ -81,11 +82,10 @@ class SplatsStage(Stage):
         Raises:
             RequestError: no such file, no splats, none in it, or some that can't be rendered.
         """
-        from pipeline.artifacts.gaussians import Gaussians, read_gaussians_ply
         from pipeline.artifacts.space.frames import VIEWERS_PLY, frame_of
         from stages.splats.placing import (
             into_world,
-            said_background,
+            read_splats,
             says_turned,
             share_in_view,
             unusable,
@@ -95,10 +95,11 @@ class SplatsStage(Stage):
         cameras = context.load("cameras")
         (path,) = context.sources.values()
         try:
-            background = config.background or said_background(path)
-            given = Gaussians(**read_gaussians_ply(path), light=None, background=background)
+            given = read_splats(path)
         except RequestError as error:
             raise RequestError(f"{SETTING}: {error}") from error
+        if config.background is not None:
+            given = replace(given, background=config.background)
         if not len(given):
             raise RequestError(f"{SETTING}: {path} holds no Gaussians. Give one that does.")
         wrong = int(unusable(given).sum())

@@ -22,12 +22,14 @@ from pipeline.errors import RequestError
 from pipeline.running.outcomes import RunSummary
 from pipeline.stage import LocalContext
 from stages.evaluate.stage import EvaluateConfig, EvaluateStage
+from stages.export.splatfiles.compressed import compressed_ply_bytes
 from stages.export.stage import ExportConfig, ExportStage
 from stages.splats.placing import said_background, share_in_view
 from stages.splats.stage import SplatsConfig, SplatsStage
 from stages.splatting.frame import move_gaussians
 from stages.splatting.rendering import render
 from tests.stages import export_scene as scene
+from tests.stages.splat_files import read_compressed_ply
 
 #: our world -> the input's millimetres: turned about no axis in particular, 20 times as large
 TURN = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]]) / 3
@@ -98,6 +100,11 @@ def test_our_own_export_comes_back_as_it_was(tmp_path: Path, frame: str) -> None
     for camera in scene.ball_cameras():
         before, after = render(case["gaussians"], camera), render(back, camera)
         np.testing.assert_allclose(after.image, before.image, atol=2e-3)
+    smaller = imported(tmp_path / "c", file.with_name("splats.compressed.ply"), frame=frame)
+    assert smaller.result("gaussians").background == grey
+    np.testing.assert_allclose(
+        render(smaller.result("gaussians"), camera).image, before.image, atol=0.05
+    )
     before_db = psnr(tmp_path / "a", case)
     after_db = psnr(tmp_path / "b", case | {"gaussians": back})
     assert 10 < before_db < 40
@@ -142,6 +149,60 @@ def test_a_scene_in_another_frame_is_told(tmp_path: Path) -> None:
     assert "may be in another frame" in told
 
 
+def packed(path: Path, gaussians: Gaussians, degree: int = 3) -> Path:
+    path.write_bytes(compressed_ply_bytes(gaussians, degree))
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_compressed_ply_is_read(tmp_path: Path, degree: int) -> None:
+    ball = scene.ball_gaussians(600, degree)
+    file = packed(tmp_path / "peer.ply", ball, degree)
+    expected, there = read_compressed_ply(file)
+    assert there == degree
+    back = imported(tmp_path / "s", file, frame="world").result("gaussians")
+    np.testing.assert_allclose(back.means, expected.means, atol=1e-6)
+    np.testing.assert_allclose(back.log_scales, expected.log_scales, atol=1e-5)
+    np.testing.assert_allclose(back.quats_wxyz, expected.quats_wxyz, atol=1e-6)
+    np.testing.assert_allclose(back.logit_opacities, expected.logit_opacities, atol=1e-4)
+    np.testing.assert_allclose(back.sh, expected.sh, atol=0.016)  # -4 and 4 are the ends of a byte
+
+
+def test_wholly_opaque_gaussians_are_drawn_and_invisible_ones_are_not(tmp_path: Path) -> None:
+    ball = scene.ball_gaussians(500)
+    for whole, part in ((np.inf, 14.0), (-np.inf, -14.0)):
+        given = ball.logit_opacities.copy()
+        given[::2] = whole
+        write_gaussians_ply(tmp_path / "peer.ply", replace(ball, logit_opacities=given))
+        read = imported(tmp_path / "s", tmp_path / "peer.ply", frame="world").result("gaussians")
+        assert np.isfinite(read.logit_opacities).all()
+        near = replace(ball, logit_opacities=np.where(np.isinf(given), part, given).astype("f4"))
+        camera = scene.ball_cameras()[0]
+        np.testing.assert_allclose(
+            render(read, camera).image, render(near, camera).image, atol=1e-4
+        )
+
+
+def test_a_compressed_ply_with_whole_opacities_is_read(tmp_path: Path) -> None:
+    """As splat-transform writes them; its colours may have no bounds of their own."""
+    file = packed(tmp_path / "peer.ply", scene.ball_gaussians(300), 0)
+    found = PlyData.read(file, mmap=False)
+    vertices, chunks = found["vertex"].data, found["chunk"].data
+    vertices["packed_color"] |= 255
+    vertices["packed_color"][7] &= 0xFFFFFF00
+    named = [n for n in chunks.dtype.names if n[-2:] not in ("_r", "_g", "_b")]
+    elements = [
+        PlyElement.describe(repack_fields(chunks[named]), "chunk"),
+        PlyElement.describe(vertices, "vertex"),
+    ]
+    PlyData(elements, byte_order="<").write(str(file))
+    read = imported(tmp_path / "s", file, frame="world").result("gaussians")
+    assert read.logit_opacities[7] < -15 and np.delete(read.logit_opacities, 7).min() > 15
+    colours = 0.5 + 0.28209479 * read.sh[:, 0]
+    red = vertices["packed_color"] >> 24
+    np.testing.assert_allclose(colours[:, 0], red / 255, atol=1e-5)
+
+
 def broken(change: Callable[[Any], None]) -> Callable[[Path], None]:
     """Writes a file of splats with one thing changed in its rows."""
 
@@ -182,13 +243,23 @@ def empty(path: Path) -> None:
     PlyData([PlyElement.describe(found["vertex"].data[:0], "vertex")]).write(str(path))
 
 
+def packed_wrong(old: bytes, new: bytes, more: bytes = b"") -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        data = packed(path, scene.ball_gaussians(300, 1), 1).read_bytes()
+        assert old in data
+        path.write_bytes(data.replace(old, new) + more)
+
+    return write
+
+
 def absurd(path: Path) -> None:
     write_gaussians_ply(path, scene.ball_gaussians(50))
     path.write_bytes(path.read_bytes().replace(b"vertex 50\n", b"vertex 99999999999\n"))
 
 
 BAD: list[tuple[Callable[[Path], Any], str]] = [
-    (lambda path: path.write_text("photograph"), "is no PLY"),
+    (lambda path: path.write_text("photograph"), "is no .ply. Of our own results give splats.ply"),
+    (lambda path: path.write_text("ply\n"), "is no whole PLY"),
     (lambda path: path.mkdir(), "there is no file"),
     (lambda path: None, "there is no file"),
     (empty, "holds no Gaussians"),
@@ -199,8 +270,13 @@ BAD: list[tuple[Callable[[Path], Any], str]] = [
     (without(*(f"f_rest_{k}" for k in range(21))), "has 24 properties f_rest_*"),
     (put("x", np.nan), "1 of the 50 Gaussians in"),
     (put("f_rest_20", np.inf), "1 of the 50 Gaussians in"),
-    (put("opacity", -np.inf), "1 of the 50 Gaussians in"),
+    (put("opacity", np.nan), "1 of the 50 Gaussians in"),
     (put("scale_1", 90.0), "a size beyond measure"),
+    (packed_wrong(b"float min_scale_y", b"float min_scale_q"), "it lacks min_scale_y"),
+    (packed_wrong(b"uint packed_scale", b"int packed_scale"), "it lacks packed_scale"),
+    (packed_wrong(b"uchar f_rest_8", b"uchar f_rest_9"), "its harmonics are not those"),
+    (packed_wrong(b"chunk 2\n", b"chunk 3\n", bytes(72)), "it has 3 chunks for 300 Gaussians"),
+    (packed_wrong(b"vertex 300\n", b"vertex 900\n"), "is cut off"),
     (broken(no_rotation), "3 of the 50 Gaussians in"),
 ]
 
