@@ -78,6 +78,7 @@ def shown(value: object, letters: int = 100) -> str:
         text = repr(value)
     except (RecursionError, ValueError):  # nested too deep; a number of too many digits
         return f"a {type(value).__name__}"
+    text = " ".join(text.split("\n"))  # as of an array
     return text if len(text) <= letters else f"{text[:letters]}..."
 
 

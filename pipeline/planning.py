@@ -106,7 +106,7 @@ def resolve_chain(
         if from_stage not in names:
             raise RequestError(
                 f"--from {from_stage}: the stages of this run are {', '.join(names)}."
-                f"{nearest(from_stage, names)}"
+                f"{nearest(str(from_stage), names)}"
             )
         names = names[names.index(from_stage) :]
     usable = usable_stages()

@@ -9,8 +9,9 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from pipeline.config import Config, RunConfig, anchored, load_config, yaml_value
-from pipeline.errors import PipelineError, RequestError
+from pipeline.config import Config, RunConfig, anchored, load_config
+from pipeline.config.asked import anchored_preset, each_override, each_stage
+from pipeline.errors import PipelineError, RequestError, shown
 from pipeline.planning import plan_chain, resolve_chain
 from pipeline.stage import stage_names
 from pipeline.store import Store, partial_name
@@ -18,7 +19,7 @@ from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.paths import home_told
+from pipeline.untrusted.paths import given_path, home_told
 
 REQUEST = "request.json"
 
@@ -150,11 +151,8 @@ def make_request(
         as_before: where no photographs are named, go on with the preset and the overrides of the
             last run; those given now come on top. A preset that is named starts from that.
     """
-    given = [images] if isinstance(images, str | Path) else list(images)
-    if "" in given:
-        raise RequestError("The name of a photograph or folder is empty; this folder is '.'.")
-    given = [home_told(path) for path in given]
-    folder = default_workspace(given) if workspace is None else Path(home_told(workspace))
+    given = _each_image(images)
+    folder = default_workspace(given) if workspace is None else given_path(workspace, "workspace")
     begun = is_workspace(folder)
     images_named = bool(given)
     taken_over: tuple[str, ...] = ()
@@ -184,25 +182,17 @@ def make_request(
     )
 
 
-def each_override(overrides: Iterable[str] | Mapping[str, Any]) -> list[str]:
-    """Settings as ``--set`` has them, each; one alone may be given as it is."""
-    if isinstance(overrides, Mapping):
-        return [f"{key}={yaml_value(value)}" for key, value in overrides.items()]
-    return [overrides] if isinstance(overrides, str) else list(overrides)
+def _each_image(images: Sequence[str | Path] | str | Path) -> list[str]:
+    """Photographs as the user names them, `~` replaced.
 
-
-def each_stage(stages: Sequence[str] | None) -> tuple[str, ...] | None:
-    """Names of stages, each; a string has them as ``--stages``, with commas between them."""
-    if isinstance(stages, str):
-        stages = [name.strip() for name in stages.split(",") if name.strip()]
-    return tuple(stages) if stages else None
-
-
-def anchored_preset(preset: str | Path | None) -> str | None:
-    """A preset as it is named in every folder: a file by its whole path."""
-    if preset is not None and Path(preset).suffix in (".yaml", ".yml") and Path(preset).is_file():
-        preset = Path(preset).absolute()
-    return str(preset) if preset is not None else None
+    Raises:
+        RequestError: what is given names none.
+    """
+    alone = isinstance(images, str | bytes | os.PathLike) or not isinstance(images, Iterable)
+    listed: list[Any] = [images] if alone else list(images)  # type: ignore[arg-type]
+    for image in listed:
+        given_path(image, "The name of a photograph or folder")
+    return [home_told(image) for image in listed]
 
 
 def _as_options(preset: str | Path | None, overrides: Iterable[str]) -> tuple[str, ...]:
@@ -368,7 +358,9 @@ def clean(
     Raises:
         RequestError: there is no such workspace.
     """
-    folder = Path(home_told(workspace))
+    folder = given_path(workspace, "workspace")
+    if not isinstance(keep, int) or keep < 0:
+        raise RequestError(f"keep is a number of results, 0 or more; this is {shown(keep)}.")
     if not is_workspace(folder):
         raise RequestError(f"{folder} is not a workspace, so nothing in it was deleted.")
     store = Store(folder)

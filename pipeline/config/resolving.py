@@ -238,16 +238,31 @@ def _section(model: type[BaseModel] | None, values: Any, begin: str | Path) -> A
     return {n: _whole(model.model_fields.get(n), value, begin) for n, value in values.items()}
 
 
-def yaml_value(value: Any) -> str:
-    """A value as --set has it, also that of a path or of numpy."""
+def yaml_value(value: object) -> str:
+    """A value as --set has it; paths and what numpy has, also in lists and mappings, as others.
+
+    Raises:
+        TypeError: there is something else in it; the message says what.
+    """
     import yaml
 
-    if isinstance(value, os.PathLike):
-        value = os.fspath(value)
-    elif hasattr(value, "item"):
-        value = value.item()
-    text = yaml.safe_dump(value, default_flow_style=True, width=10**6)
+    text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10**6)
     return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _plain(value: Any) -> Any:
+    """A value without types of libraries."""
+    if isinstance(value, Mapping):
+        return {_plain(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if hasattr(value, "tolist"):  # of numpy or torch
+        return value.tolist()
+    if value is not None and type(value) not in (bool, int, float, str):
+        raise TypeError(f"{shown(value)} is a value of a kind that no setting has")
+    return value
 
 
 def _field_at(model: type[BaseModel] | None, parts: Sequence[str]) -> FieldInfo | None:

@@ -12,7 +12,7 @@ import typer
 from pipeline.errors import RequestError, nearest
 from pipeline.front import completion
 from pipeline.process.privacy import SHARES, Share
-from pipeline.untrusted.paths import home_told
+from pipeline.untrusted.paths import given_path
 
 Word = TypeVar("Word", bound=str)
 
@@ -23,9 +23,7 @@ def path(text: str) -> Path:
     Raises:
         RequestError: it is, as where a variable of the shell is not set.
     """
-    if not text:
-        raise RequestError("A path that was given is empty. The current folder is called '.'.")
-    return Path(home_told(text))
+    return given_path(text, "A path that was given")
 
 
 def named(parameter: typer.CallbackParam, text: str | None) -> str | None:

@@ -55,6 +55,8 @@ def settings(stage: str | None = None) -> list[Setting]:
     Raises:
         RequestError: there are none of this name.
     """
+    if not isinstance(stage, str | None):
+        raise RequestError(f"settings are those of a stage's name; this is {shown(stage)}.")
     models = config_models()
     known = [found for name, model in models.items() for found in model_settings(model, name)]
     if stage is None:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
-from pipeline.errors import RequestError
+from pipeline.errors import RequestError, shown
 
 Given = TypeVar("Given", str, Path)
 
@@ -30,6 +30,24 @@ def user_path(text: str | Path, setting: str) -> Path:
     if trouble is not None:
         raise RequestError(f"{setting}: {_shown(text)} {trouble}.")
     return Path(text).expanduser()
+
+
+def given_path(value: object, what: str) -> Path:
+    """A path that a caller gives, with `~` and `~name` replaced (`home_told`).
+
+    Args:
+        what: what it is called, to begin messages with.
+
+    Raises:
+        RequestError: it is no path; an empty one is none either, which pathlib takes for the
+            current folder.
+    """
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or "\0" in text:
+        raise RequestError(f"{what} is to be a text or a pathlib.Path, not {shown(value)}.")
+    if not text:
+        raise RequestError(f"{what} is empty. The current folder is called '.'.")
+    return Path(home_told(text))
 
 
 def home_told(path: str | Path) -> str:

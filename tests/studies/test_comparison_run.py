@@ -116,12 +116,13 @@ def test_what_was_put_right_about_the_teeth_holds_in_its_fits_too(workspace, tmp
     assert not (fits / "teeth.yaml").exists()
 
 
-def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_path):
+def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
     home = tmp_path / "w"
     shutil.copytree(workspace, home, symlinks=True)
     truth = tmp_path / "transforms.json"
     shutil.copy(SAMPLES / "transforms.json", truth)
-    changes = {**SETTINGS, "evaluate.ground_truth": str(truth)}
+    changes = {**SETTINGS, "evaluate.ground_truth": f"~/{truth.name}"}
     pipeline.run(PHOTOS, workspace=home, overrides=changes, stages=["evaluate"])
     found = compare(home, colmap=model, fit=False)
     assert found.figures["reference"] == "ground truth"

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pipeline.config import anchored
-from pipeline.errors import RequestError
+from pipeline.config.asked import anchored_preset, each_override, each_stage
+from pipeline.errors import RequestError, shown
 from pipeline.files import write_json
 from pipeline.installed import library_version
 from pipeline.measure import usable_cores
@@ -35,7 +36,7 @@ from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import run_case, stop
 from pipeline.studies.jobs import only_one
 from pipeline.untrusted.names import readable
-from pipeline.workspace import anchored_preset, each_override, each_stage
+from pipeline.untrusted.paths import given_path
 
 Keep = Literal["workspace", "results"]
 KEEPS: tuple[Keep, ...] = get_args(Keep)
@@ -84,12 +85,14 @@ def batch(
             in it, the disk is full, or the scheduler is gone.
     """
     require_dask()
-    if jobs < 1:
-        raise RequestError(f"jobs is how many cases run at a time, 1 at least; this is {jobs}.")
+    if not isinstance(jobs, int) or jobs < 1:
+        raise RequestError(
+            f"jobs is how many cases run at a time, 1 at least; this is {shown(jobs)}."
+        )
     texts = tuple(map(anchored, each_override(overrides)))
     retry = [retry] if isinstance(retry, str) else retry
-    place = Path(cases)
-    folder = Path(out) if out is not None else Path("runs") / f"batch_{_called(place)}"
+    place = given_path(cases, "cases")
+    folder = given_path(out, "out") if out is not None else Path("runs") / f"batch_{_called(place)}"
     progress = progress or Silent()
     start = time.perf_counter()
     named = each_stage(stages)

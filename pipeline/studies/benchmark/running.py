@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import parse_override
+from pipeline.config.asked import each_override
+from pipeline.errors import RequestError, shown
 from pipeline.files import write_json
 from pipeline.installed import module_command
 from pipeline.measure import usable_cores
@@ -32,6 +34,7 @@ from pipeline.studies.benchmark.suite import LoadedSuite, load_suite
 from pipeline.studies.benchmark.tables import build_table, paper_note
 from pipeline.studies.benchmark.writing import write_tables
 from pipeline.studies.jobs import only_one
+from pipeline.untrusted.paths import given_path
 
 #: How the process of one cell is started.
 WORKER = module_command("pipeline.studies.benchmark.worker")
@@ -74,10 +77,16 @@ def benchmark(
     Raises:
         RequestError: the suite is wrong, its data are missing, or `out` can't be used.
     """
-    loaded = load_suite(suite, data)
-    pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
-    cells, tables = plan_cells(loaded, dict(pairs))
-    folder = Path(out) if out is not None else Path("runs") / f"benchmark_{loaded.path.stem}"
+    if not isinstance(jobs, int) or jobs < 1:
+        raise RequestError(f"jobs is how many workspaces at a time, 1 at least; not {shown(jobs)}.")
+    given_path(suite, "suite")
+    loaded = load_suite(suite, None if data is None else given_path(data, "data"))
+    cells, tables = plan_cells(loaded, dict(map(parse_override, each_override(overrides))))
+    folder = (
+        given_path(out, "out")
+        if out is not None
+        else Path("runs") / f"benchmark_{loaded.path.stem}"
+    )
     threads = max(1, usable_cores() // jobs)
     places = {cell.workspace.partition("/")[0] for cell in cells}
     alone = only_one(folder.absolute(), "benchmark", places, "Wait for it")

@@ -26,6 +26,7 @@ from pipeline.studies.compare.page import write_report
 from pipeline.studies.compare.tables import markdown, tables_of
 from pipeline.studies.report import run_report
 from pipeline.studies.report.compared import FILE, FOLDER
+from pipeline.untrusted.paths import given_path, home_told
 from pipeline.workspace import read_request
 
 #: The stages whose cameras or points are compared where the workspace has them, in their order.
@@ -100,17 +101,21 @@ def compare(
     Raises:
         RequestError: no such workspace or files, or nothing to compare with.
     """
-    home = Path(workspace)
+    home = given_path(workspace, "workspace")
+    model, truth, surface = (
+        None if path is None else given_path(path, name)
+        for path, name in ((colmap, "colmap"), (ground_truth, "ground_truth"), (mesh, "mesh"))
+    )
     with kept_for(share_for(home)):
         return _compare(
-            home, colmap, run_colmap, ground_truth, mesh, fit, threads or usable_cores(),
+            home, model, run_colmap, truth, surface, fit, threads or usable_cores(),
             reporter or Reporter(),
         )  # fmt: skip
 
 
 def _compare(
-    home: Path, colmap: str | Path | None, run_colmap: bool, ground_truth: str | Path | None,
-    mesh: str | Path | None, fit: bool, threads: int, reporter: Reporter,
+    home: Path, colmap: Path | None, run_colmap: bool, ground_truth: Path | None,
+    mesh: Path | None, fit: bool, threads: int, reporter: Reporter,
 ) -> Comparison:  # fmt: skip
     store, prepared = _workspace(home)
     views = _loaded(store, prepared, "views").views
@@ -118,12 +123,12 @@ def _compare(
         ground_truth = _of_the_run(store, "ground_truth", reporter)
         mesh = mesh or (ground_truth and _of_the_run(store, "mesh", reporter))
     _check(colmap, run_colmap, ground_truth, mesh)
-    given = read_largest(Path(colmap), views) if colmap is not None else None
+    given = read_largest(colmap, views) if colmap is not None else None
     truth: dict[str, Camera] = {}
     units = "arbitrary"
     if ground_truth is not None:
-        truth, units = read_truth(Path(ground_truth), views)
-    surface = clouds.read_surface(Path(mesh), list(truth.values())) if mesh else None
+        truth, units = read_truth(ground_truth, views)
+    surface = clouds.read_surface(mesh, list(truth.values())) if mesh else None
     store.create()
     folder = stage_folder(home, FOLDER)
 
@@ -198,8 +203,9 @@ def _of_the_run(store: Store, setting: str, reporter: Reporter) -> Path | None:
     """The file that the run was evaluated with."""
     used = store.current("evaluate")
     named = used.manifest["config"].get(setting) if used else None
-    if named is None or Path(named).exists():
-        return Path(named) if named else None
+    path = Path(home_told(named)) if named else None
+    if path is None or path.exists():
+        return path
     option = setting.replace("_", "-")
     reporter.message(
         f"evaluate.{setting} of the run is not there any more ({named}), and nothing is compared "
@@ -209,8 +215,7 @@ def _of_the_run(store: Store, setting: str, reporter: Reporter) -> Path | None:
 
 
 def _check(
-    colmap: str | Path | None, run_colmap: bool, ground_truth: str | Path | None,
-    mesh: str | Path | None,
+    colmap: Path | None, run_colmap: bool, ground_truth: Path | None, mesh: Path | None,
 ) -> None:  # fmt: skip
     if colmap is not None and run_colmap:
         raise RequestError("Give either --colmap FOLDER or --run-colmap, not both.")

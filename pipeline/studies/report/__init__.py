@@ -21,6 +21,8 @@ def run_report(workspace: str | Path, *, anonymous: bool = False) -> Path:
     """
     from pipeline.process.privacy import kept_for, share_for
     from pipeline.studies.report.run import write_run_report
+    from pipeline.untrusted.paths import given_path
 
-    with kept_for(share_for(Path(workspace))):
-        return write_run_report(Path(workspace), anonymous)
+    home = given_path(workspace, "workspace")
+    with kept_for(share_for(home)):
+        return write_run_report(home, anonymous)
