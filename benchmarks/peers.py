@@ -206,9 +206,14 @@ def main() -> None:
     }  # fmt: skip
     cost = measured(filled(options.command, values), out / "log.txt", options.threads)
     ply = newest(folder, options.ply or "splats.ply")
-    rows = compared(
-        options.workspace, options.name, ply, cost, options.iterations, options.background
-    )
+    from pipeline.errors import PipelineError
+
+    try:
+        rows = compared(
+            options.workspace, options.name, ply, cost, options.iterations, options.background
+        )
+    except PipelineError as error:  # a scene in another frame, or of another format
+        raise SystemExit(str(error)) from error
     table = [f"| {' | '.join(COLUMNS)} |", "|---|" + "---:|" * (len(COLUMNS) - 1), *rows]
     print("\n".join(table))
     (out / "table.md").write_text("\n".join(table) + "\n")

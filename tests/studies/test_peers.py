@@ -90,6 +90,7 @@ def test_what_can_not_be_measured_is_said(tmp_path: Path) -> None:
         ),
         ("c", [sys.executable, "-c", "print('{ply}')"], r"has written no splats\.ply"),
         ("c", [sys.executable, "-c", ""], r"is there already"),
+        ("d", [sys.executable, "-c", "open('{ply}', 'w')"], r"w is not a workspace"),
     ):
         done = peers(tmp_path, "-w", "w", "--name", name, "--", *command)
         assert done.returncode == 1
