@@ -126,7 +126,10 @@ def test_the_truth_of_the_run_is_that_of_its_comparison(workspace, model, tmp_pa
     pipeline.run(PHOTOS, workspace=home, overrides=changes, stages=["evaluate"])
     found = compare(home, colmap=model, fit=False)
     assert found.figures["reference"] == "ground truth"
-    truth.unlink()
+    elsewhere = truth.rename(tmp_path / "elsewhere.json")
+    found = compare(home, colmap=model, ground_truth=elsewhere)
+    fits = found.figures["fits"]
+    assert len(fits) == 3 and not any("failure" in row for row in fits)
     told = Told()
     found = compare(home, colmap=model, fit=False, reporter=told)
     assert found.figures["reference"] == "COLMAP, given model"

@@ -164,7 +164,8 @@ def _compare(
         why = "COLMAP made no model of these views"
         figures["fits"] = fit_rows(
             home, folder / "colmap", best.model.folder if best and best.model else None, why,
-            threads=threads, reporter=reporter, message=reporter.message,
+            truth=ground_truth, mesh=mesh, threads=threads, reporter=reporter,
+            message=reporter.message,
         )  # fmt: skip
         figures["fits_from"] = best.name if best else None
     tables = tables_of(figures)

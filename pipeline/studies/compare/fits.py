@@ -19,6 +19,7 @@ from pipeline.front.commands import run
 from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
 from pipeline.store import Result, Store
+from pipeline.untrusted.paths import home_told
 from pipeline.workspace import read_request
 
 #: Stages of a run that a comparison repeats, in their order.
@@ -30,8 +31,8 @@ OURS = "this pipeline"
 
 
 def fit_rows(
-    workspace: Path, folder: Path, model: Path | None, why_not: str, *, threads: int,
-    reporter: Reporter | None, message: Callable[[str], None],
+    workspace: Path, folder: Path, model: Path | None, why_not: str, *, truth: Path | None,
+    mesh: Path | None, threads: int, reporter: Reporter | None, message: Callable[[str], None],
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Score the fit of a workspace, and the same fit from COLMAP's cameras, and from its points.
 
@@ -43,6 +44,8 @@ def fit_rows(
         folder: workspace of the fits from COLMAP.
         model: COLMAP's model, or None.
         why_not: said in the rows of COLMAP where there is no model.
+        truth, mesh: what takes the place of those that the run was scored with where they have
+            gone, if anything.
     """
     store = Store(workspace)
     results = {name: store.current(name) for name in REPEATED}
@@ -64,6 +67,7 @@ def fit_rows(
                 "init.method": "auto", "init.cameras": str(model.resolve()), "init.points": points,
                 "threads": threads, "report": False,
             }  # fmt: skip
+            changes |= _in_place_of_gone(changes, truth, mesh)
             stages = [n for n in present if points == "dense" or n not in FOR_DENSE]
             if "evaluate" not in stages:
                 stages.append("evaluate")
@@ -85,6 +89,17 @@ def settings_of(results: Mapping[str, Result | None]) -> dict[str, Any]:
                 if field in known:
                     changes[f"{name}.{field}"] = value
     return changes
+
+
+def _in_place_of_gone(
+    settings: Mapping[str, Any], truth: Path | None, mesh: Path | None
+) -> dict[str, Any]:
+    """What a run is scored with, where a file of these has gone."""
+    given = {"evaluate.ground_truth": truth, "evaluate.mesh": mesh if truth else None}
+    named = {name: settings.get(name) for name in given}
+    if all(path is None or Path(home_told(path)).exists() for path in named.values()):
+        return {}
+    return {name: path and str(path.absolute()) for name, path in given.items()}
 
 
 def take_corrections(workspace: Path, folder: Path) -> None:
