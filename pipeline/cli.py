@@ -27,6 +27,7 @@ from pipeline.front.options import (
     Verify,
     Workspace,
     answer,
+    only_the_answer,
     only_workspace,
     sharing,
 )
@@ -128,20 +129,21 @@ def run_command(
     changes = list(overrides or [])
     if frames is not None:
         changes.append(f"views.frames={frames}")
-    summary = run(
-        images or [],
-        workspace=workspace,
-        preset=config,
-        overrides=changes,
-        stages=stages,
-        from_stage=from_stage,
-        force=force,
-        dry_run=dry_run,
-        verify=verify,
-        share=sharing(share),
-        profile=profile,
-        reporter=make_reporter(quiet=quiet or dry_run, verbose=verbose),
-    )
+    with only_the_answer(as_json):
+        summary = run(
+            images or [],
+            workspace=workspace,
+            preset=config,
+            overrides=changes,
+            stages=stages,
+            from_stage=from_stage,
+            force=force,
+            dry_run=dry_run,
+            verify=verify,
+            share=sharing(share),
+            profile=profile,
+            reporter=make_reporter(quiet=quiet or dry_run, verbose=verbose),
+        )
     show = print_dry_run if dry_run else print_summary
     answer(
         summary.to_dict, lambda: show(summary), as_json=as_json, quiet=quiet and not dry_run

@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline import installed
 from pipeline.config import Config, flattened, result_fields
-from pipeline.errors import RequestError, nearest
+from pipeline.errors import PipelineError, RequestError, StageError, nearest
 from pipeline.files import canonical_json, sha256_text
 from pipeline.stage import Stage, get_stage, usable_stages
 from pipeline.store import Result, Store
@@ -312,7 +312,7 @@ def plan_stage(
             f"Name them as well: pipeline run PHOTOGRAPHS -w {quote(str(store.root))}"
         )
     request = {"images": list(images), "workspace": store.root}
-    sources = stage.sources(config.sections[name], request)
+    sources = _sources(stage, config, request)
     hashes = {label: _hash_source(label, path) for label, path in sources.items()}
     material = key_material(stage, config, inputs, hashes)
     key = key_of(material)
@@ -330,6 +330,24 @@ def plan_stage(
     elif pointer and pointer["key"] == key:
         planned.reasons = list(pointer.get("reasons", []))
     return planned
+
+
+def _sources(stage: Stage, config: Config, request: Mapping[str, Any]) -> Mapping[str, Path]:
+    """The files that a stage will read, as it names them.
+
+    Raises:
+        StageError: it fails in that.
+    """
+    try:
+        found = stage.sources(config.sections[stage.name], request)
+        return {label: Path(path) for label, path in found.items()}
+    except (PipelineError, OSError):
+        raise
+    except Exception as error:
+        raise StageError(
+            f"The stage '{stage.name}' failed where it names the files that it reads, which is a "
+            f"mapping of labels to paths: {type(error).__name__}: {error}."
+        ) from error
 
 
 def plan_chain(

@@ -6,7 +6,7 @@ A preset is a YAML file with a section per stage; `extends:` names the preset th
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,8 +110,12 @@ def result_fields(config: BaseModel) -> dict[str, Any]:
         if isinstance(value, str) and names_path(field):  # its content counts, not its place
             kept[name] = "a file"
             continue
-        is_model = isinstance(value, BaseModel)
-        kept[name] = result_fields(value) if is_model else config.model_dump(mode="json")[name]
+        if isinstance(value, BaseModel):
+            kept[name] = result_fields(value)
+            continue
+        dumped = config.model_dump(mode="json")[name]
+        # a set has another order in every process
+        kept[name] = sorted(dumped, key=repr) if isinstance(value, Set) else dumped
     return kept
 
 

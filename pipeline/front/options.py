@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -13,6 +17,9 @@ from pipeline.errors import RequestError, nearest
 from pipeline.front import completion
 from pipeline.process.privacy import SHARES, Share
 from pipeline.untrusted.paths import given_path
+
+#: Of the process.
+STDOUT, STDERR = 1, 2
 
 Word = TypeVar("Word", bound=str)
 
@@ -120,6 +127,25 @@ Verbose = Annotated[
     bool, typer.Option("-v", "--verbose", help="Say more: each step, keys, memory.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@contextlib.contextmanager
+def only_the_answer(as_json: bool) -> Iterator[None]:
+    """Where an answer is to be JSON, what stages and their libraries print meanwhile goes to the
+    standard error, so that nothing else stands on the standard output."""
+    if not as_json:
+        yield
+        return
+    sys.stdout.flush()
+    kept = os.dup(STDOUT)
+    os.dup2(STDERR, STDOUT)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what C has not written yet
+        os.dup2(kept, STDOUT)
+        os.close(kept)
 
 
 def answer(

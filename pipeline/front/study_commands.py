@@ -20,6 +20,7 @@ from pipeline.front.options import (
     Verbose,
     answer,
     one_of,
+    only_the_answer,
     only_workspace,
     out_option,
     path,
@@ -79,11 +80,12 @@ def compare_command(
     from pipeline.studies.compare.compare import compare
     from pipeline.studies.compare.tables import print_tables, tables_of
 
-    found = compare(
-        workspace or only_workspace(), colmap=colmap, run_colmap=run_colmap,
-        ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads,
-        reporter=make_reporter(quiet=quiet, verbose=verbose),
-    )  # fmt: skip
+    with only_the_answer(as_json):
+        found = compare(
+            workspace or only_workspace(), colmap=colmap, run_colmap=run_colmap,
+            ground_truth=ground_truth, mesh=mesh, fit=fit, threads=threads,
+            reporter=make_reporter(quiet=quiet, verbose=verbose),
+        )  # fmt: skip
 
     def show() -> None:
         print_tables(tables_of(found.figures))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -70,4 +71,6 @@ class RunContext(StageContext):
 
     def summarize(self, **figures: float | int | str) -> None:
         for name, value in figures.items():  # a sum of an array is numpy's, and no JSON
-            self.figures[name] = value.item() if hasattr(value, "item") else value
+            value = value.item() if hasattr(value, "item") else value
+            finite = not isinstance(value, float) or math.isfinite(value)
+            self.figures[name] = value if finite else str(value)  # which no JSON has

@@ -43,8 +43,9 @@ def explained(
             " ".join([f"The stage '{stage}' needs more memory than there is.", *thrift])
         )
     where = traceback.extract_tb(error.__traceback__)[-1]
+    said = " ".join(str(error).split())
     return StageError(
-        f"The stage '{stage}' failed with a fault of ours: {type(error).__name__}: {error} "
+        f"The stage '{stage}' failed with a fault of ours: {type(error).__name__}: {said} "
         f"({Path(where.filename).name}, line {where.lineno}). What earlier stages computed is "
         "kept. Run again with --debug for the whole trace, and please report it."
     )

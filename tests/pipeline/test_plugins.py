@@ -26,6 +26,7 @@ PHOTOS = ROOT / "data_samples" / "three_photos"
 #: The whole of a plug-in: a kind of its own, a stage that makes it, its part of the report.
 PLUGIN = """
 import json
+import os
 from dataclasses import dataclass
 from pipeline.artifacts import Artifact
 from pipeline.stage import Stage, StageConfig
@@ -48,13 +49,16 @@ class SharpnessStage(Stage):
 
     class Config(StageConfig):
         step: int = 1
+        which: frozenset[str] = frozenset("abcdefgh")  # in another order in every process
 
     def run(self, context):
+        print("said by Python")
+        os.write(1, b"said by C")
         step = context.config.step
         views = context.load("views").views
         found = {v.name: float(abs(v.image[step:] - v.image[:-step]).mean()) for v in views}
         context.save(Sharpness(found))
-        context.summarize(sharpest=max(found, key=found.get))
+        context.summarize(sharpest=max(found, key=found.get), most=float("inf"))
 
     def report(self):
         return {"sharpness": told}
@@ -102,8 +106,11 @@ def run(folder: Path, *more: str, stages: str = "views,sharp") -> subprocess.Com
 def test_a_stage_with_a_kind_of_its_own_runs_and_is_reported(tmp_path: Path) -> None:
     done = run(install(tmp_path), "--set", "sharp.step=2")
     assert done.returncode == 0, done.stderr
-    stages = {stage["name"]: stage for stage in json.loads(done.stdout)["stages"]}
+    assert "said by Python" in done.stderr and "said by C" in done.stderr
+    answer = json.loads(done.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    stages = {stage["name"]: stage for stage in answer["stages"]}
     assert stages["sharp"]["action"] == "ran"
+    assert stages["sharp"]["figures"]["summary"]["most"] == "inf"
     file = tmp_path / stages["sharp"]["folder"] / "sharpness" / "sharpness.json"
     written = json.loads(file.read_text())
     assert sorted(written) == ["000", "001", "002"]
@@ -211,6 +218,13 @@ def test_writing_what_was_not_declared_is_a_fault_in_words(tmp_path: Path) -> No
     done = run(install(tmp_path, code))
     assert done.returncode == 1
     assert "The stage 'sharp' writes sharpness without saying so" in done.stderr
+
+
+def test_files_that_are_named_wrongly_are_a_fault_of_the_stage(tmp_path: Path) -> None:
+    code = f"{PLUGIN}\nSharpnessStage.sources = lambda *given: None\n"
+    done = run(install(tmp_path, code))
+    assert done.returncode == 1
+    assert "The stage 'sharp' failed where it names the files that it reads" in done.stderr
 
 
 def test_settings_of_a_run_are_no_names_for_stages() -> None:
