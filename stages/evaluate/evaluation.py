@@ -82,7 +82,8 @@ def evaluate(context: StageContext, painter: Callable[..., Callable[[Camera], Re
     background = config.background or gaussians.background
     draw = painter(gaussians, background=background, threads=context.threads)
     masks = labelled(context.sources, "masks")
-    truth = _truth(context, [*views.views, *held])
+    files = labelled(context.sources, "ground_truth")
+    truth = read_truth(files.values(), views.views, held) if files else None
     held = _straightened(context, views, cameras, held) if truth is not None else held
     regions = {view.name: scoring_mask(masks, view) for view in (*views.views, *held)}
     _check_masks(context, masks, [*views.views, *held], regions)
@@ -164,11 +165,6 @@ def _check_masks(
             f"evaluate.masks: no pixel of the masks of {', '.join(empty)} is 255, so that nothing "
             "is scored inside them."
         )
-
-
-def _truth(context: StageContext, views: list[View]) -> Truth | None:
-    files = labelled(context.sources, "ground_truth")
-    return read_truth(files.values(), views) if files else None
 
 
 def _straightened(

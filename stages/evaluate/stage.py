@@ -20,7 +20,7 @@ class EvaluateStage(Stage):
     """Views, cameras and Gaussians -> metrics; more of them where the truth is known."""
 
     name = "evaluate"
-    version = 10
+    version = 11
     summary = "figures of input and held-out views, poses and geometry; side by side pictures"
     Config = EvaluateConfig
     requires = ("views", "cameras", "gaussians")

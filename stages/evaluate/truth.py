@@ -37,14 +37,15 @@ class Truth:
     units: str
 
 
-def read_truth(files: Iterable[Path], views: Sequence[View]) -> Truth:
-    """True cameras of views, by the names of their files.
+def read_truth(files: Iterable[Path], inputs: Sequence[View], held: Sequence[View]) -> Truth:
+    """True cameras of input views and of photographs held out, by the names of their files.
 
     Raises:
-        RequestError: the files are damaged, or have no camera of at least two of the views.
+        RequestError: the files are damaged, or have no camera of at least two of them.
     """
     known, scale = read_cameras(files, SETTING)
-    matched = matching_cameras(known, views, SETTING)
+    matched = matching_cameras(known, inputs, SETTING, held)
+    views = [*inputs, *held]
     cameras = {
         view.name: pinhole_camera(view, matched[view.name], SETTING)
         for view in views

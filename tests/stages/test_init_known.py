@@ -335,6 +335,23 @@ def test_the_names_that_fit_most_photographs_count():
         matching_cameras([*by_view, KnownCamera("b/000.jpg", lens, pose)], views)
 
 
+def test_photographs_held_out_do_not_say_which_names_count():
+    """Of a film 003 is held out: what is exported as 003 shows 004."""
+    pose, image = np.eye(4), np.zeros((3, 4, 3), np.float32)
+    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
+    exported = [KnownCamera(f"{k:03d}.png", lens, pose) for k in range(5)]
+    inputs = [n for n in range(6) if n != 3]
+    views = [View(f"{k:03d}", image, source_name=f"{n:03d}.jpg") for k, n in enumerate(inputs)]
+    held = [View("h000", image, source_name="003.jpg")]
+    found = matching_cameras(exported, views, "cameras", held)
+    assert {name: known.name for name, known in found.items()} == {
+        f"{k:03d}": f"{k:03d}.png" for k in range(5)
+    }
+    named = [KnownCamera(f".\\images\\{n:03d}.jpg", lens, pose) for n in range(6)]  # of Windows
+    found = matching_cameras(named, views, "cameras", held)
+    assert found["004"].name == ".\\images\\005.jpg" and "h000" in found
+
+
 def test_tracks_are_triangulated_and_wrong_matches_dropped():
     rng = np.random.default_rng(1)
     cameras = [Camera(str(k), 400, 400, 500, 500, 200, 200, look_at(15 * k)) for k in range(3)]

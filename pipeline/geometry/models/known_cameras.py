@@ -175,8 +175,9 @@ def _lens(lens: Lens) -> Any:
 
 
 def matching_cameras(
-    cameras: list[KnownCamera], views: Iterable[View], setting: str = SETTING
-) -> dict[str, KnownCamera]:
+    cameras: list[KnownCamera], views: Iterable[View], setting: str = SETTING,
+    others: Iterable[View] = (),
+) -> dict[str, KnownCamera]:  # fmt: skip
     """Name of a view -> its camera: by the name of the source file, with or without suffix.
 
     Models that we exported have the names of views. Of all these ways the one that finds most
@@ -186,18 +187,23 @@ def matching_cameras(
         cameras: of the model.
         views: with names of their own.
         setting: name of the setting that gave the model, for messages.
+        others: photographs that are held out, which have no such names; they are found in the way
+            that finds most of the views.
 
     Raises:
         RequestError: fewer than two views have a camera, or one has several.
     """
     views = list(views)
+    counted = {view.name for view in views}
+    views += others
     schemes: tuple[tuple[Callable[[View], str], Callable[[str], str]], ...] = (
         (lambda view: view.source_name, str),
-        (lambda view: PurePath(view.source_name).name, lambda name: PurePath(name).name),
-        (lambda view: PurePath(view.source_name).stem, lambda name: PurePath(name).stem),
-        (lambda view: view.name, lambda name: PurePath(name).stem),  # a model that we exported
+        (lambda view: PurePath(view.source_name).name, lambda name: _path(name).name),
+        (lambda view: PurePath(view.source_name).stem, lambda name: _path(name).stem),
+        (lambda view: view.name, lambda name: _path(name).stem),  # a model that we exported
     )
     best: dict[str, list[KnownCamera]] = {}
+    most = (0, 0)
     for name_of_view, name_of_camera in schemes:
         fitting = {
             view.name: [c for c in cameras if name_of_camera(c.name) == name_of_view(view)]
@@ -205,8 +211,9 @@ def matching_cameras(
             if name_of_view(view)
         }
         found = {name: those for name, those in fitting.items() if those}
-        if len(found) > len(best):
-            best = found
+        number = len(found.keys() & counted), len(found)
+        if number > most:
+            best, most = found, number
     several = next((those for those in best.values() if len(those) > 1), None)
     if several is not None:
         raise RequestError(
@@ -221,6 +228,11 @@ def matching_cameras(
         f"The names there are like {cameras[0].name}, the photographs' like "
         f"{views[0].source_name or views[0].name}."
     )
+
+
+def _path(name: str) -> PurePath:
+    """The path of an image as a model has it, perhaps one that was made under Windows."""
+    return PurePath(name.replace("\\", "/"))
 
 
 def pinhole_camera(view: View, known: KnownCamera, setting: str = SETTING) -> Camera:
