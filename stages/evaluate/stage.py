@@ -13,7 +13,7 @@ from pipeline.untrusted.paths import user_path
 from stages.evaluate.config import EvaluateConfig
 
 #: Suffixes of masks.
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class EvaluateStage(Stage):

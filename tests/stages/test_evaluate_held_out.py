@@ -243,6 +243,9 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     (tmp_path / "m.ply").write_text("ply")
     with pytest.raises(RequestError, match="without true cameras"):
         stage.sources(EvaluateConfig(mesh=str(tmp_path / "m.ply")), {})
+    (tmp_path / "000.webp").write_bytes(b"")
+    found = stage.sources(EvaluateConfig(masks=str(tmp_path)), {})
+    assert found["masks/000.webp"] == tmp_path / "000.webp"
 
 
 def test_the_place_of_the_truth_is_not_part_of_the_key() -> None:
