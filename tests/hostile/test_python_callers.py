@@ -48,6 +48,11 @@ WRONG: list[tuple[Callable[..., Any], tuple[Any, ...], Mapping[str, Any], str]] 
     (dentalsplat.benchmark, ("smoke",), {"out": ""}, "out is empty"),
     (dentalsplat.batch, (5,), {}, f"cases {NO_PATH}5"),
     (dentalsplat.batch, (".",), {"jobs": "2"}, "1 at least; this is '2'"),
+    (dentalsplat.batch, (".",), {"keep": "all"}, "keep is workspace or results; this is 'all'"),
+    (dentalsplat.batch, (".",), {"memory": "4 GB"}, "memory is a number, 0 or more"),
+    (dentalsplat.batch, (".",), {"minutes": -1}, "minutes is a number, 0 or more; this is -1"),
+    (dentalsplat.batch, (".",), {"minutes": np.nan}, "this is nan"),
+    (dentalsplat.batch, (".",), {"retry": 5}, "retry is 'failed', or names of cases; this is 5"),
 ]
 
 

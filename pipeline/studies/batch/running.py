@@ -85,12 +85,9 @@ def batch(
             in it, the disk is full, or the scheduler is gone.
     """
     require_dask()
-    if not isinstance(jobs, int) or jobs < 1:
-        raise RequestError(
-            f"jobs is how many cases run at a time, 1 at least; this is {shown(jobs)}."
-        )
-    texts = tuple(map(anchored, each_override(overrides)))
     retry = [retry] if isinstance(retry, str) else retry
+    _check(jobs, keep, memory, minutes, retry)
+    texts = tuple(map(anchored, each_override(overrides)))
     place = given_path(cases, "cases")
     folder = given_path(out, "out") if out is not None else Path("runs") / f"batch_{_called(place)}"
     progress = progress or Silent()
@@ -325,6 +322,25 @@ def _gone() -> RequestError:
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
+
+
+def _check(jobs: object, keep: object, memory: object, minutes: object, retry: object) -> None:
+    """Refuse what only a program can give; the command line knows what each may be.
+
+    Raises:
+        RequestError: it names the argument.
+    """
+    if not isinstance(jobs, int) or jobs < 1:
+        raise RequestError(
+            f"jobs is how many cases run at a time, 1 at least; this is {shown(jobs)}."
+        )
+    if keep not in KEEPS:
+        raise RequestError(f"keep is {' or '.join(KEEPS)}; this is {shown(keep)}.")
+    for name, number in (("memory", memory), ("minutes", minutes)):
+        if number is not None and not (isinstance(number, int | float) and 0 <= number < math.inf):
+            raise RequestError(f"{name} is a number, 0 or more; this is {shown(number)}.")
+    if not isinstance(retry, Iterable) or not all(isinstance(name, str) for name in retry):
+        raise RequestError(f"retry is 'failed', or names of cases; this is {shown(retry)}.")
 
 
 def _called(place: Path) -> str:
