@@ -16,6 +16,7 @@ from pipeline.errors import RequestError
 from pipeline.geometry.models.known_cameras import model_files, read_cameras
 from pipeline.geometry.models.model_points import read_model_points
 from pipeline.studies.compare.evidence import mapped_keypoints, read_evidence
+from pipeline.untrusted.scenes.colmap import read_model
 
 #: Counts that no file could hold are refused, not waited for.
 pytestmark = pytest.mark.timeout(60)
@@ -200,6 +201,27 @@ def test_a_damaged_line_is_named(
     path.write_bytes(_text(path.read_bytes(), old, new))
     said = refused(folder)
     assert words in said and file in said
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", " \n"])
+def test_a_model_without_keypoints_has_lines_with_nothing_in_them(
+    models: Path, tmp_path: Path, end: str
+) -> None:
+    """Programs that know poses alone write empty lines, some of them under Windows."""
+    folder = Path(shutil.copytree(models / "txt", tmp_path / "m"))
+    for path in folder.iterdir():
+        lines = path.read_text().splitlines()
+        if path.stem == "images":
+            title = [line for line in lines if line[:1] == "#"]
+            images = [line for line in lines if line[:1] != "#"][::2]
+            lines = [*title, *(line for image in images for line in (image, ""))]
+        text = "".join(f"{line}{end}" for line in lines)
+        path.write_bytes(b"\xef\xbb\xbf" * (end == "\r\n") + text.encode())
+    found, whole = read_model(folder), read_model(models / "txt")
+    assert found.lenses == whole.lenses and found.frames == whole.frames
+    for number, image in whole.images.items():
+        assert found.images[number].cam_from_world == image.cam_from_world
+        assert len(found.images[number].has_point) == 0
 
 
 def test_entries_that_stand_twice_are_refused(models: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
+from codecs import BOM_UTF8
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,7 @@ class _TextRow(Row):
 
 
 def _text_rows(file: str, data: bytes) -> Iterator[Row]:
+    data = data.removeprefix(BOM_UTF8)
     if data and not data.endswith((b"\n", b"\r")):
         raise UnusableFile(f"can't be read: {file} is cut off: its last line has no end")
     pairs = file.startswith("images")

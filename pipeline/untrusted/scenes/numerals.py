@@ -21,6 +21,8 @@ def numbers_in(text: bytes, where: str) -> npt.NDArray[np.float64]:
     """
     if b"\0" in text:
         raise UnusableFile(f"holds zero bytes in {where}, which are no text")
+    if text.isspace():  # of which numpy makes a number
+        return np.zeros(0)
     try:
         with warnings.catch_warnings():  # older numpy only warns, and stops where it stopped
             warnings.simplefilter("error")
