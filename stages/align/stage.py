@@ -83,10 +83,16 @@ class AlignStage(Stage):
                 "surface. Take photographs that overlap more, 10 to 20 degrees apart, in focus."
             )
         names = [view.name for view in views.views if view.name in merged]
-        missing = [view.name for view in views.views if view.name not in start.cameras]
+        # of what has no camera from before an earlier stage has told
+        told = set(by_name) - set(given.by_name()) if given is not None else set()
+        missing = [
+            view.source_name or view.name
+            for view in views.views
+            if view.name not in {*start.cameras, *told}
+        ]
         if missing:
             context.warn(
-                f"Not in the scene, as no pointmap ties them to the others: view "
+                f"Not in the scene, as no pointmap ties them to the others: "
                 f"{', '.join(missing)}. Photographs between them and the others would."
             )
         masked = {
@@ -132,7 +138,7 @@ class AlignStage(Stage):
         if np.isfinite(cloud.residual):
             figures["depth_residual_percent"] = round(100 * cloud.residual, 3)
         context.summarize(
-            points=len(cloud), fill_points=cloud.fill, views=len(placed),
+            points=len(cloud), fill_points=cloud.fill, views_registered=len(placed),
             views_total=len(views), **figures,
         )  # fmt: skip
 

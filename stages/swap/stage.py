@@ -106,9 +106,13 @@ class SwapStage(Stage):
                 "Give the model of undistorted photographs, or start from these cameras with "
                 "init.cameras, which takes the distortion out."
             )
-        dropped = sorted(set(now) - set(moved))
+        dropped = [
+            view.source_name or view.name
+            for view in views.views
+            if view.name in now and view.name not in moved
+        ]
         if dropped:
-            context.warn(f"The model has no camera of view {', '.join(dropped)}; left out.")
+            context.warn(f"The model has no camera of {', '.join(dropped)}; left out.")
         context.save(
             replace(
                 present,
@@ -116,4 +120,4 @@ class SwapStage(Stage):
                 provisional=False,
             )
         )
-        context.summarize(views=len(moved), views_total=len(views))
+        context.summarize(views_registered=len(moved), views_total=len(views))

@@ -119,7 +119,7 @@ def test_cameras_from_noisy_pointmaps_with_holes_and_outliers(world, tmp_path):
     assert np.mean([c.rotation[1, 1] for c in cameras.cameras]) > 0.99  # y down
     depth = cameras.cameras[0].project(points.positions)[1]
     assert 0.9 < np.median(depth) < 1.1
-    assert context.figures["views"] == 4
+    assert context.figures["views_registered"] == 4
     assert context.figures["points"] == len(points)
     assert not context.warnings
 
@@ -309,7 +309,12 @@ def test_views_without_a_pair_are_left_out_and_named(world, tmp_path):
     pairs = Pointmaps(list(pointmaps(world, 0.0))[:2])
     context = run(tmp_path, AlignConfig(iterations=5), views=views_of(world), pointmaps=pairs)
     assert [c.name for c in context.result("cameras").cameras] == ["000", "001", "002"]
-    assert "no pointmap ties them to the others: view 003." in context.warnings[0]
+    assert "no pointmap ties them to the others: 003." in context.warnings[0]
+    known = Cameras(tuple(world[0][:3]))  # why one has none an earlier stage has said
+    everything = Pointmaps(list(pointmaps(world, 0.0)))
+    inputs = {"views": views_of(world), "pointmaps": everything, "cameras": known}
+    context = run(tmp_path / "known", AlignConfig(iterations=5), **inputs)
+    assert len(context.result("cameras")) == 3 and context.warnings == []
 
 
 def test_masked_pixels_give_no_points(world, tmp_path):

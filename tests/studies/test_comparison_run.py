@@ -314,6 +314,16 @@ def test_cameras_are_swapped_for_a_models_in_the_same_world(tmp_path, model):
         swapped(tmp_path, model, alone)
 
 
+def test_swap_names_the_photographs_that_it_leaves_out(tmp_path, model):
+    named = [replace(c, name=f"{k:03d}") for k, c in enumerate(true_cameras())]
+    told = json.loads((SAMPLES / "transforms.json").read_text())
+    gone = told["frames"].pop()["file_path"]
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    context = swapped(tmp_path, tmp_path / "transforms.json", Cameras(tuple(named)))
+    assert context.warnings == [f"The model has no camera of {gone}; left out."]
+    assert context.figures == {"views_registered": 2, "views_total": 3}  # as the summary says it
+
+
 def test_swap_says_that_it_leaves_distortion_in(tmp_path, model):
     named = [replace(c, name=f"{k:03d}") for k, c in enumerate(true_cameras())]
     told = json.loads((SAMPLES / "transforms.json").read_text()) | {"k1": -0.3}
