@@ -44,6 +44,7 @@ class PlannedStage:
         key: None while pending.
         material: what the key is the hash of.
         sources: label -> file, for a stage that reads the user's files.
+        notes: what there is to say about the request.
     """
 
     name: str
@@ -53,6 +54,7 @@ class PlannedStage:
     key: str | None = None
     material: dict[str, Any] = field(default_factory=dict)
     sources: Mapping[str, Path] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
     result: Result | None = None
     failure: str | None = None
     resumable: bool = False
@@ -311,12 +313,13 @@ def plan_stage(
             f"No photographs are named, and {store.root} remembers none: no run was started there. "
             f"Name them as well: pipeline run PHOTOGRAPHS -w {quote(str(store.root))}"
         )
-    request = {"images": list(images), "workspace": store.root}
+    notes: list[str] = []
+    request = {"images": list(images), "workspace": store.root, "tell": notes.append}
     sources = _sources(stage, config, request)
     hashes = {label: _hash_source(label, path) for label, path in sources.items()}
     material = key_material(stage, config, inputs, hashes)
     key = key_of(material)
-    planned = PlannedStage(name, "cached", inputs, [], key, material, sources)
+    planned = PlannedStage(name, "cached", inputs, [], key, material, sources, notes)
     planned.result = store.find(name, key)
     if planned.result is None:
         current = store.current(name)

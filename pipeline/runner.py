@@ -84,6 +84,9 @@ class Runner:
         self._computing = computing or self._computing
         try:
             self.reporter.foreseen(self._foreseen(planned, force))
+            for stage in planned:
+                for note in stage.notes:
+                    self.reporter.message(f"{stage.name}: {note}")
             with self._kernels(stage.name for stage in planned if force or stage.result is None):
                 return self._run_all(force)
         finally:
@@ -126,7 +129,11 @@ class Runner:
                 reasons = stage.reasons
             last = stage.result or self.store.current(stage.name)
             figures = {"wall_seconds": last.manifest["wall_seconds"]} if last else {}
-            found.append(StageOutcome(stage.name, action, reasons, stage.key, figures=figures))
+            found.append(
+                StageOutcome(
+                    stage.name, action, reasons, stage.key, figures=figures, warnings=stage.notes
+                )
+            )
         return found
 
     def _check_upstream(self) -> None:

@@ -153,7 +153,8 @@ class Stage(ABC):
         Args:
             config: the stage's validated config.
             request: what the user asked for (`images`: list of paths; `workspace`: its folder,
-                which may hold files of the user's).
+                which may hold files of the user's), and `tell`, where somebody hears it:
+                called with what is to be said about that before anything runs.
 
         Returns:
             A stable label for each file (no folders: a moved case is the same case) -> its path.

@@ -19,9 +19,8 @@ from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.own import REQUEST
 from pipeline.untrusted.paths import given_path, home_told
-
-REQUEST = "request.json"
 
 #: Folders that say nothing about the case inside them; their parent's name does.
 GENERIC_FOLDERS = {"images", "image", "frames", "photos", "photographs", "input", "inputs", "rgb"}

@@ -16,6 +16,7 @@ import pytest
 
 import pipeline
 from pipeline import cli
+from pipeline.running.reporter import Reporter
 
 SAMPLES = Path(__file__).resolve().parents[1] / "data_samples" / "three_photos"
 PHOTOS = sorted(SAMPLES.glob("*.jpg"))
@@ -150,6 +151,32 @@ def test_photographs_that_share_nothing(workspace: Path, tmp_path: Path) -> None
     status, paragraph = call(workspace, str(tmp_path), apart=True)
     assert status == 3, paragraph
     assert ".png" in paragraph and "photograph" in paragraph
+
+
+def test_pictures_of_earlier_runs_are_left_out_and_that_is_said(
+    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(SAMPLES, tmp_path / "photos", ignore=shutil.ignore_patterns("depth"))
+    shutil.copytree(workspace, tmp_path / "w")
+    for photo in PHOTOS:  # as if a run had cached photographs of such names
+        shutil.copy(photo, next((tmp_path / "w" / "views").glob("*/views")) / f"own_{photo.name}")
+    heard: list[str] = []
+    reporter = Reporter()
+    reporter.message = heard.append  # type: ignore[method-assign]
+    for times in (1, 2):
+        summary = pipeline.run(
+            tmp_path / "**" / "*.jpg", workspace=tmp_path / "other", stages=["views"],
+            reporter=reporter,
+        )  # fmt: skip
+        notes = [text for text in summary.stages[0].warnings if "earlier runs have made" in text]
+        assert summary.stages[0].figures["summary"]["views"] == 3
+        assert len(notes) == 1 and heard.count(f"views: {notes[0]}") == times
+    words = [str(tmp_path / "**" / "*.jpg"), "--dry-run", "-w", str(tmp_path / "other")]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr(sys, "argv", ["pipeline", "run", *words])
+        cli.main()
+    assert ended.value.code == 0
+    assert "earlier runs have made (views/ of a workspace)" in capsys.readouterr().out
 
 
 def test_full_disk(tmp_path: Path) -> None:

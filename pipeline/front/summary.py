@@ -12,7 +12,7 @@ from rich.table import Table
 
 from pipeline.front.progress import cost, describe, in_words
 from pipeline.front.settings import Setting
-from pipeline.running.outcomes import RunSummary
+from pipeline.running.outcomes import RunSummary, StageOutcome
 from pipeline.stage import Finding
 from pipeline.workspace import StageStatus
 
@@ -47,9 +47,7 @@ def print_summary(summary: RunSummary) -> None:
         )
     console.print(table)
     for stage in summary.stages:
-        for warning in stage.warnings:
-            console.print(f"[yellow]Note[/] ({stage.name}): ", end="")
-            console.print(warning, markup=False)
+        _print_notes(console, stage)
         pictures = stage.folder / "pictures" if stage.folder else None
         if pictures and pictures.is_dir():
             console.print(f"Pictures ({stage.name}): {pictures}/", soft_wrap=True, markup=False)
@@ -91,15 +89,24 @@ def headline(summary: RunSummary) -> str:
     return "; ".join(parts)
 
 
+def _print_notes(console: Console, stage: StageOutcome) -> None:
+    for warning in stage.warnings:
+        console.print(f"[yellow]Note[/] ({stage.name}): ", end="")
+        console.print(warning, markup=False)
+
+
 def print_dry_run(summary: RunSummary) -> None:
     """What a run would do."""
     table = _table("stage", "", "last time", "why")
     for stage in summary.stages:
         last = in_words(stage.figures["wall_seconds"]) if stage.figures else ""
         table.add_row(stage.name, stage.action, last, escape("; ".join(stage.reasons)))
-    _console().print(table)
+    console = _console()
+    console.print(table)
+    for stage in summary.stages:
+        _print_notes(console, stage)
     if told := cost(summary.stages):
-        _console().print(told, markup=False)
+        console.print(told, markup=False)
 
 
 def print_status(stages: list[StageStatus]) -> None:

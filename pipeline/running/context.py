@@ -27,7 +27,7 @@ class RunContext(StageContext):
         self.threads = config.threads
         self.scratch = folder / "scratch"
         self.sources = planned.sources
-        self.warnings: list[str] = []
+        self.warnings = list(planned.notes)  # these have been said
         self.figures: dict[str, Any] = {}
         self.outputs: list[str] = []
         self._planned = planned

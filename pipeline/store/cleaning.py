@@ -9,9 +9,10 @@ from pathlib import Path
 from filelock import Timeout
 
 from pipeline.store.failures import EVIDENCE, FAILURE
-from pipeline.store.locks import LOCK, lock_of
-from pipeline.store.places import ASIDE, is_folder, is_there, remove, size_of
+from pipeline.store.locks import lock_of
+from pipeline.store.places import is_folder, is_there, remove, size_of
 from pipeline.store.results import KEY_LENGTH
+from pipeline.untrusted.own import ASIDE, LOCK
 
 #: Ends the name of the folder that a result is written into.
 PARTIAL = ".partial"

@@ -16,8 +16,9 @@ from pipeline.files import write_atomic
 from pipeline.process.privacy import share_for
 from pipeline.store.places import free_for_file, is_folder, set_aside
 from pipeline.store.records import DamagedError, Owner, read_record
+from pipeline.untrusted.own import LOCK
 
-LOCK, OWNER = ".lock", ".owner.json"
+OWNER = ".owner.json"
 
 
 def lock_of(folder: Path) -> FileLock:

@@ -8,9 +8,7 @@ import stat
 from pathlib import Path
 
 from pipeline.errors import RequestError
-
-#: Part of the name of what was set aside: `clean` deletes it.
-ASIDE = ".quarantined"
+from pipeline.untrusted.own import ASIDE
 
 
 def is_there(path: Path) -> bool:

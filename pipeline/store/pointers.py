@@ -18,8 +18,7 @@ from pipeline.store.records import (
     write_sealed,
 )
 from pipeline.store.results import KEY_LENGTH
-
-POINTER = "current.json"
+from pipeline.untrusted.own import POINTER
 
 
 class Pointers:

@@ -7,15 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.process.privacy import Share, tighten
-from pipeline.store.locks import LOCK
-from pipeline.store.places import ASIDE, is_folder, is_there
-
-#: What a workspace and the folders of a benchmark and a batch hold besides the folders of stages.
-_OWN = {
-    LOCK, "request.json", "pages.json", "results", "report.html", "report_anonymous.html",
-    "check.html", "teeth.yaml", "logs", "profile", "compare", "dicom", "register",
-    "cells", "results.json", "tables.md", "tables.csv", "batch.json", "summary.csv", "summary.html",
-}  # fmt: skip
+from pipeline.untrusted.own import is_own
 
 
 def tighten_workspace(root: Path, share: Share, more: Collection[str] = ()) -> list[Path]:
@@ -32,19 +24,13 @@ def tighten_workspace(root: Path, share: Share, more: Collection[str] = ()) -> l
     failed: list[Path] = []
     alone = True
     for path in root.iterdir():
-        if _is_own(path) or path.name in more:
+        if is_own(path) or path.name in more:
             failed += tighten(path, share)
         elif not path.name.endswith(".tmp"):
             alone = False
     if alone:
         failed += tighten(root, share)
     return failed
-
-
-def _is_own(path: Path) -> bool:
-    if path.name in _OWN or ASIDE in path.name:
-        return True
-    return is_folder(path) and any(is_there(path / name) for name in (LOCK, "current.json"))
 
 
 def tell(failed: list[Path]) -> None:

@@ -62,11 +62,21 @@ def matching(pattern: str | Path) -> list[Path]:
     Folders on the way that are there mean themselves, also with letters that a pattern gives
     another meaning.
     """
-    path = Path(pattern)
-    there = next((p for p in path.parents if os.path.isdir(p)), Path())  # noqa: PTH112 - never raises
-    rest = str(path.relative_to(there))
-    found = glob.glob(os.path.join(glob.escape(str(there)), rest), recursive=True)  # noqa: PTH118, PTH207
+    there, rest = _known_part(Path(pattern))
+    found = glob.glob(os.path.join(glob.escape(str(there)), str(rest)), recursive=True)  # noqa: PTH118, PTH207
     return [Path(match) for match in found]
+
+
+def names_folder(pattern: str | Path, folder: Path) -> bool:
+    """Does a pattern that fits something in a folder name that folder, and not only match it?"""
+    there, rest = _known_part(Path(pattern))
+    return there.is_relative_to(folder) or folder.name in rest.parts
+
+
+def _known_part(pattern: Path) -> tuple[Path, Path]:
+    """The folder on the way of a pattern that is there, and what the pattern says from there on."""
+    there = next((p for p in pattern.parents if os.path.isdir(p)), Path())  # noqa: PTH112 - never raises
+    return there, pattern.relative_to(there)
 
 
 def _trouble(text: str | Path) -> str | None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import glob
 import os
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from shlex import quote
 
 from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, opened, sort_of
 from pipeline.untrusted.films import KNOWN as KNOWN_FILMS
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.paths import matching
+from pipeline.untrusted.own import has_results, is_own, made_around
+from pipeline.untrusted.paths import matching, names_folder
 from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
 from stages.views.sampling import natural_key
 
@@ -86,12 +88,15 @@ def is_video(path: PurePath) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
+def find_images(
+    requested: Sequence[str | Path], tell: Callable[[str], None] = lambda message: None
+) -> dict[str, Path]:
     """Expand a request to label -> file, in natural order.
 
     Args:
         requested: folders (the images directly in them), image files, patterns such as
             ``photos/*.jpg``, or one video.
+        tell: called with what a pattern matches and is not taken.
 
     Returns:
         Labels are file names; where two files share one, the folder's name comes before it.
@@ -102,7 +107,7 @@ def find_images(requested: Sequence[str | Path]) -> dict[str, Path]:
     """
     files: dict[Path, None] = {}
     for item in requested:
-        for path in _expand(item):
+        for path in _expand(item, tell):
             files[Path(os.path.abspath(path))] = None  # noqa: PTH100 (keeps symbolic links)
     paths = list(files)
     videos = [path for path in paths if is_video(path)]
@@ -199,12 +204,12 @@ def held_labels(labels: Iterable[str], held_out: Sequence[str]) -> tuple[str, ..
     return tuple(label for label in labels if label in found)
 
 
-def _expand(item: str | Path) -> list[Path]:
+def _expand(item: str | Path, tell: Callable[[str], None]) -> list[Path]:
     path = Path(item).expanduser()
     status = _stat(path)
     if status is None:
         if glob.has_magic(str(path)):
-            return _expand_pattern(path)
+            return _expand_pattern(path, tell)
         raise RequestError(
             f"There is no file or folder {path}.{_hint(path)} Name a folder of photographs, "
             "several files, a pattern in quotes such as 'photos/*.jpg', or a video."
@@ -221,15 +226,25 @@ def _expand(item: str | Path) -> list[Path]:
     return [path]
 
 
-def _expand_pattern(path: Path) -> list[Path]:
+def _expand_pattern(path: Path, tell: Callable[[str], None]) -> list[Path]:
     matches = matching(path)
-    usable = [m for m in matches if not m.is_dir() and (is_photograph(m) or is_video(m))]
-    if not usable:
-        what = (
-            f"matches {len(matches)} files, none of them a photograph"
-            if matches
-            else "matches nothing"
+    found = [m for m in matches if not m.is_dir() and (is_photograph(m) or is_video(m))]
+    ours = {folder: _made_here(folder, path) for folder in {match.parent for match in found}}
+    usable = [match for match in found if not ours[match.parent]]
+    made = sorted(f"{name}/" for name in set(ours.values()) if name)
+    some = ", ".join(made[:3]) + (", ..." if made[3:] else "")
+    if made and usable:
+        tell(
+            f"{len(found) - len(usable)} pictures and films that the pattern matches lie in what "
+            f"earlier runs have made ({some} of a workspace) and were left out. To use them all "
+            "the same, name their folder."
         )
+    if not usable:
+        what = "matches nothing"
+        if matches:
+            what = f"matches {len(matches)} files, none of them a photograph"
+        if made:
+            what += f", only what earlier runs have made ({some} of a workspace)"
         raise RequestError(
             f"The pattern {path} {what}. Check the folder and the suffix (patterns tell JPG from "
             "jpg), and put it in quotes so that the shell leaves it alone."
@@ -237,6 +252,13 @@ def _expand_pattern(path: Path) -> list[Path]:
     for match in usable:
         _refuse_special(match, "Among the photographs,")
     return usable
+
+
+def _made_here(folder: Path, pattern: Path) -> str:
+    """What a folder that a pattern leads into is called, if runs have made what it holds and the
+    pattern doesn't name it; else nothing."""
+    unnamed = (own for own in made_around(folder / "_") if not names_folder(pattern, own))
+    return next((own.name for own in unnamed), "")
 
 
 def _refuse_special(path: Path, what: str) -> None:
@@ -258,14 +280,21 @@ def _expand_folder(folder: Path) -> list[Path]:
         return images
     videos = [entry.path.name for entry in entries if is_video(entry.path)]
     advice = f"Photographs are {KNOWN}."
+    with_results = has_results(folder)
     if videos:
         advice = f"To use the video, name it: {folder / videos[0]}"
     else:
         inside = [
             entry.path
             for entry in entries
-            if entry.is_folder and any(is_photograph(e.path) for e in _try_list(entry.path))
-        ]
+            if entry.is_folder and not (with_results and is_own(entry.path))
+            and any(is_photograph(e.path) for e in _try_list(entry.path))
+        ]  # fmt: skip
+        if with_results and not inside:
+            advice = (
+                "Runs have put there what they made. To go on with a workspace: pipeline run -w "
+                f"{quote(str(folder))}"
+            )
         if inside:
             likely = min(inside, key=lambda path: path.name.lower() not in USUAL_FOLDERS)
             advice = f"Did you mean the folder in it: {likely}"

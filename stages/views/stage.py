@@ -74,7 +74,7 @@ class ViewsStage(Stage):
     )
 
     def sources(self, config: ViewsConfig, request: Mapping[str, Any]) -> Mapping[str, Path]:
-        files = find_images(request["images"])
+        files = find_images(request["images"], request.get("tell", lambda message: None))
         masks = find_masks(config.masks, files) if config.masks is not None else {}
         # frames of a film and photographs of a sheet are known when these are read
         of_files = [name for name in config.held_out if name.rpartition("#")[0] not in files]

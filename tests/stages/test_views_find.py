@@ -135,6 +135,42 @@ def test_folders_on_the_way_to_a_pattern_mean_themselves(
     assert list(find_images(["*/1.png"])) == ["1.png"]
 
 
+def workspace(folder: Path) -> Path:
+    """A workspace with pictures in results, in a stage's folder, and photographs of the user's."""
+    touch(folder, "request.json", "fit/current.json", "fit/0123456789ab/renders/a.png")
+    touch(folder, "export/.lock", "export/0123456789ab/exports/preview.png", "photos/mine.png")
+    (folder / "results").symlink_to("export/0123456789ab/exports")
+    return folder
+
+
+def test_what_runs_have_made_is_no_photograph(tmp_path: Path) -> None:
+    touch(
+        tmp_path, "photos/a.png", "photos/results/b.png", "x/results/scene.json", "x/results/c.png"
+    )
+    own = workspace(tmp_path / "w")
+    told: list[str] = []
+    found = find_images([tmp_path / "**" / "*.png"], told.append)
+    assert sorted(found) == ["a.png", "b.png", "mine.png"]
+    assert len(told) == 1 and "4 pictures" in told[0] and "fit/, results/ of a w" in told[0]
+    for named in (own / "results", own / "results" / "*.png", tmp_path / "*" / "results" / "p*"):
+        assert list(find_images([named], told.append)) == ["preview.png"]
+    assert len(find_images([own / "fit" / "**" / "*.png"], told.append)) == 1
+    assert len(told) == 1
+    with pytest.raises(RequestError, match=r"only what earlier runs have made .results/ of a"):
+        find_images([own / "*s" / "pre*.png"])
+
+
+def test_a_workspace_in_place_of_photographs(tmp_path: Path) -> None:
+    own = workspace(tmp_path / "w")
+    with pytest.raises(RequestError, match=r"Did you mean the folder in it: .*w/photos"):
+        find_images([own])
+    (own / "photos" / "mine.png").unlink()
+    with pytest.raises(RequestError, match=r"To go on with a workspace: pipeline run -w .*/w"):
+        find_images([own])
+    touch(own, "1.png")
+    assert list(find_images([own])) == ["1.png"]
+
+
 def test_equal_names_get_their_folders(tmp_path: Path) -> None:
     touch(tmp_path, "p/left/1.png", "p/right/1.png", "q/right/1.png", "p/2.png", "p/masks/3.png",
           "q/masks/2.png")  # fmt: skip

@@ -18,6 +18,7 @@ from pipeline.studies.batch.records import Case
 from pipeline.studies.batch.sources import contents_of
 from pipeline.untrusted.files import sort_of
 from pipeline.untrusted.names import printable
+from pipeline.untrusted.own import has_results, is_own
 from pipeline.workspace import GENERIC_FOLDERS
 
 #: Folders of folders of cases (a clinic, a year, a patient) are gone through this deep.
@@ -217,6 +218,9 @@ def _folder(
         yield from _folder(root, inner[0], called, (*above, identity), seen)
     elif inner and len(above) <= DEEPEST:
         yield from _walk(root, folder, (*above, identity), seen)
+    elif has_results(folder):
+        why = "Runs have put there what they made, and there are no photographs beside it."
+        yield Case("", called, settled="skipped", reason=why)
     elif inner:
         why = f"Folders are gone through {DEEPEST} deep, and this one lies deeper."
         yield Case("", called, settled="wrong", reason=why)
@@ -256,14 +260,17 @@ def _holds_pictures(folder: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[tuple[Path, str]]:
-    """What lies in a folder: each with ``folder``, ``picture``, ``film``, ``other``, or a
-    description of what it is else."""
+    """What lies in a folder, without what runs have put there: each with ``folder``, ``picture``,
+    ``film``, ``other``, or a description of what it is else."""
     from stages.views.find import is_photograph, is_video
     from stages.views.sampling import natural_key
 
     found = []
+    with_results = has_results(folder)
     for name in sorted(os.listdir(folder), key=natural_key):  # noqa: PTH208
         path = folder / name
+        if with_results and is_own(path):
+            continue
         try:
             mode = path.stat().st_mode
         except FileNotFoundError:

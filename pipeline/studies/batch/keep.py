@@ -15,7 +15,7 @@ from pipeline.pages.page import CHECK, REPORT
 from pipeline.stage import stage_names
 from pipeline.store import Store
 from pipeline.store.places import is_folder, is_there, remove, size_of
-from pipeline.workspace import REQUEST
+from pipeline.untrusted.own import REQUEST
 
 #: Bytes that a case may have with ``--keep results``; and what the files may have together that a
 #: case is kept for: photographs of 1024 pixels make a viewer page of 8 to 10 MB.

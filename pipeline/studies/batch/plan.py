@@ -15,7 +15,6 @@ from pipeline.files import read_json
 from pipeline.studies.batch.find import Names, find_cases, mark_duplicates
 from pipeline.studies.batch.listing import read_cases
 from pipeline.studies.batch.records import (
-    BATCH,
     FAILED,
     FINAL,
     Case,
@@ -25,6 +24,7 @@ from pipeline.studies.batch.records import (
     workspace_of,
 )
 from pipeline.studies.batch.sources import settings_of, with_others
+from pipeline.untrusted.own import BATCH
 
 
 @dataclass(frozen=True)

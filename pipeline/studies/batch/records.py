@@ -30,8 +30,6 @@ FAILED = ("refused", "wrong", "fault", "killed")
 Settled = Literal["", "wrong", "duplicate", "skipped"]
 
 FOLDERS = ("cases", "records", "thumbnails", "logs")
-#: File of a batch's folder that says which one it is.
-BATCH = "batch.json"
 
 #: What a file beside the photographs is for, its path, bytes and time of change (ns); without a
 #: path: what is wrong with it.

@@ -25,7 +25,6 @@ from pipeline.studies.batch.keep import thumbnail_of
 from pipeline.studies.batch.plan import Plan, check_folder, make_plan
 from pipeline.studies.batch.progress import Lines, Silent, by_state
 from pipeline.studies.batch.records import (
-    BATCH,
     FOLDERS,
     Case,
     new_record,
@@ -36,6 +35,7 @@ from pipeline.studies.batch.summary import write_summary
 from pipeline.studies.batch.task import run_case, stop
 from pipeline.studies.jobs import only_one
 from pipeline.untrusted.names import readable
+from pipeline.untrusted.own import BATCH
 from pipeline.untrusted.paths import given_path
 
 Keep = Literal["workspace", "results"]
