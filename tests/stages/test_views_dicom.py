@@ -89,6 +89,41 @@ def test_a_palette() -> None:
     np.testing.assert_array_equal(found[..., 1], 255 - GRAY)
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_palette_of_8_bits_in_words(bits: int) -> None:
+    """Whatever its descriptor says: some write 16 and mean 8."""
+    parts: dict[str, Any] = {}
+    for place, name in enumerate(("Red", "Green", "Blue")):
+        parts[f"{name}PaletteColorLookupTableDescriptor"] = [256, 0, bits]
+        table = np.arange(256, dtype="<u2") // (place + 1)
+        parts[f"{name}PaletteColorLookupTableData"] = table.tobytes()
+    found = decoded(dicom_photograph(GRAY, PhotometricInterpretation="PALETTE COLOR", **parts))
+    np.testing.assert_array_equal(found, np.stack([GRAY, GRAY // 2, GRAY // 3], -1))
+
+
+@pytest.mark.parametrize(
+    ("said", "shape"),
+    [
+        ({"PixelAspectRatio": [2, 1]}, (140, 97)),
+        ({"PixelAspectRatio": [5, 6], "PixelSpacing": [1, 1]}, (70, 116)),
+        ({"PixelSpacing": [".1", ".1001"]}, (70, 97)),
+        ({"NominalScannedPixelSpacing": [".2", ".1"]}, (140, 97)),
+        ({"PixelAspectRatio": [0, 0], "ImagerPixelSpacing": [".3", ".1"]}, (210, 97)),
+        ({"PixelAspectRatio": [5, 1]}, (70, 97)),
+        ({"PixelSpacing": ["-1", "1"]}, (70, 97)),
+        ({"PixelSpacing": "1"}, (70, 97)),
+        ({"PixelSpacing": None}, (70, 97)),
+    ],
+)
+def test_pixels_that_are_not_square(said: dict[str, Any], shape: tuple[int, int]) -> None:
+    """The picture comes out as it was taken; elements that are damaged cost nothing."""
+    found = decode_dicom(as_bytes(dicom_photograph(RGB, FocalLengthIn35mmFilm=100, **said)))
+    assert found.rgb.shape == (*shape, 3)
+    assert found.focal_px == pytest.approx(100 / np.hypot(36, 24) * np.hypot(*shape))
+    back = Image.fromarray(found.rgb).resize((W, H), Image.Resampling.BOX)
+    assert np.abs(np.asarray(back).astype(int) - RGB).mean() < 2
+
+
 @pytest.mark.parametrize(("kind", "error"), [("JPEG", 4.0), ("JPEG2000", 0.0)])
 def test_compressed(kind: str, error: float) -> None:
     assert np.abs(decoded(compressed(RGB, kind)).astype(int) - RGB).mean() <= error

@@ -9,6 +9,7 @@ Source: DICOM PS3.3 A.8 (Secondary Capture), A.32 (Visible Light), C.7.6.3 (Imag
 from __future__ import annotations
 
 import io
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,18 +37,23 @@ _COLOURS = (
     "RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT", "MONOCHROME1", "MONOCHROME2",
     "PALETTE COLOR",
 )  # fmt: skip
+#: Where the height and the width of a pixel may stand, what counts first.
+_SIDES = ("PixelAspectRatio", "PixelSpacing", "ImagerPixelSpacing", "NominalScannedPixelSpacing")
+_TABLES = [f"{colour}PaletteColorLookupTable" for colour in ("Red", "Green", "Blue")]
 #: All that is read: no other element is parsed or kept.
 _TAGS: list[Any] = [
     "SOPClassUID", "Rows", "Columns", "SamplesPerPixel", "PhotometricInterpretation",
     "PlanarConfiguration", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
     "NumberOfFrames", "PixelData", "ExtendedOffsetTable", "ExtendedOffsetTableLengths",
-    "ICCProfile", "FocalLengthIn35mmFilm", "AcquisitionDateTime",
-    *(f"{colour}PaletteColorLookupTable{part}"
-      for colour in ("Red", "Green", "Blue") for part in ("Data", "Descriptor")),
+    "ICCProfile", "FocalLengthIn35mmFilm", "AcquisitionDateTime", *_SIDES,
+    *(f"{table}{part}" for table in _TABLES for part in ("Data", "Descriptor")),
 ]  # fmt: skip
 #: Bytes a pixel that decoding takes at most: colours are converted in floating point.
 MEMORY = 40.0
 _LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
+#: Pixels are this much higher than wide, or wider than high, at most; more is damage. Below the
+#: least they count as square: spacings are rounded.
+WIDEST_PIXEL, LEAST_ODD = 4.0, 1.005
 
 
 def decode_dicom(data: bytes) -> Photo:
@@ -112,10 +118,26 @@ def _decode(data: bytes) -> Photo:
         eight = 255 - eight
     profile = found.get("ICCProfile")
     rgb, _ = shown(Image.fromarray(eight), bytes(profile) if profile else None)
+    higher = _height_by_width(found)
+    if higher != 1:  # none of the pixels are lost
+        width, height = round(width / min(higher, 1)), round(height * max(higher, 1))
+        check_size(width, height, MEMORY)
+        rgb = np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BICUBIC))
     focal = focal_in_pixels(
         {FOCAL_LENGTH_35MM: found.get("FocalLengthIn35mmFilm")}, width, height
     )  # fmt: skip
     return Photo(rgb, None, 1, focal, _taken_at(str(found.get("AcquisitionDateTime") or "")))
+
+
+def _height_by_width(found: Any) -> float:
+    """Of a pixel, by the first element that says it; 1 where it is square or nonsense is said."""
+    for name in _SIDES:
+        with suppress(TypeError, ValueError, ZeroDivisionError):
+            height, width = map(float, found[name].value if name in found else ())
+            higher = height / width
+            odd = max(higher, 1 / higher)
+            return higher if LEAST_ODD < odd <= WIDEST_PIXEL else 1.0
+    return 1.0
 
 
 def _taken_at(text: str) -> float | None:
@@ -146,8 +168,11 @@ def _pixels(found: Any, colours: str, stored: int) -> tuple[npt.NDArray[Any], in
             )
         pixels, _ = decoder.as_array(found, index=0)
     if colours == "PALETTE COLOR":
+        # some write 8 bits into the words of a table and call them 16
+        tables = [np.frombuffer(found[f"{name}Data"].value, np.uint8) for name in _TABLES]
         pixels = apply_color_lut(pixels, found)
-        stored = 16 if pixels.dtype.itemsize == 2 else 8
+        wide = pixels.dtype.itemsize == 2 and any(table[1::2].any() for table in tables)
+        stored = 16 if wide else 8
     return pixels, stored
 
 
