@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 from pipeline.errors import RequestError
-from pipeline.untrusted.own import ASIDE
+from pipeline.untrusted.own import ASIDE, POINTER, RESULTS, has_results
 
 
 def is_there(path: Path) -> bool:
@@ -63,6 +63,24 @@ def free_for_file(path: Path) -> Path:
     if path.is_symlink() or (is_there(path) and not path.is_file()):
         set_aside(path)
     return path
+
+
+def check_place(folder: Path) -> None:
+    """Make sure that a folder that is to be written into is none of a workspace's results.
+
+    What lies there is thrown away with them, and `results` is passed on: no names belong into it.
+
+    Raises:
+        RequestError: it is one, or lies in one.
+    """
+    there = folder.resolve()
+    for place in (there, *there.parents, folder.absolute()):
+        computed = place.name == RESULTS or is_there(place / POINTER)
+        if computed and has_results(place.parent):
+            raise RequestError(
+                f"{folder} belongs to the results of the workspace {place.parent}, and whatever "
+                "else is put there goes with them. Choose another folder with -o (or -w)."
+            )
 
 
 def stage_folder(root: Path, stage: str) -> Path:

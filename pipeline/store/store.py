@@ -44,6 +44,7 @@ from pipeline.store.faults import reason_of
 from pipeline.store.links import NO_LINKS, link_to
 from pipeline.store.locks import locked
 from pipeline.store.places import (
+    check_place,
     is_there,
     make_folder,
     remove,
@@ -95,8 +96,9 @@ class Store:
             more: names of folders besides those of stages that are the workspace's own.
 
         Raises:
-            RequestError: it can't be made or written to.
+            RequestError: it can't be made or written to, or belongs to another's results.
         """
+        check_place(self.root)
         try:
             make_writable(self.root)
             remove_leftovers(self.root)

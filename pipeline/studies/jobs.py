@@ -19,6 +19,7 @@ from pipeline.files import make_writable
 from pipeline.store import Store
 from pipeline.store.faults import reason_of
 from pipeline.store.locks import lock_of
+from pipeline.store.places import check_place
 from pipeline.untrusted.names import readable
 
 
@@ -51,8 +52,10 @@ def results_in(folder: Path) -> Iterator[None]:
     """Make the folder that results are to be written into; without any in the end it goes again.
 
     Raises:
-        RequestError: it can't be written to, as is to be known before the work.
+        RequestError: it can't be written to, as is to be known before the work, or belongs to the
+            results of a workspace.
     """
+    check_place(folder)
     new = not folder.exists()
     try:
         make_writable(folder)

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.artifacts.metrics import Metrics
+from pipeline.errors import RequestError
 from pipeline.files import (
     canonical_json,
     content_hash,
@@ -24,6 +25,7 @@ from pipeline.files import (
 )
 from pipeline.store import Result, Store
 from pipeline.store import store as store_module
+from pipeline.studies.jobs import results_in
 
 KEY = "a" * 64
 FIGURES: dict[str, Any] = {"key_material": {}, "summary": {}, "warnings": []}
@@ -191,6 +193,26 @@ def test_a_run_that_is_killed_while_it_commits_can_go_on(
     with store.lock("fit", print):
         assert value_of(store) == 2
         assert not (tmp_path / "fit" / KEY[:12] / "scratch").exists()
+
+
+def test_nothing_else_is_put_among_results(run: Any, toys: Path) -> None:
+    """What lies there goes with them, and `results` is passed on."""
+    run()
+    home = toys / "w"
+    result = Store(home).current("publish")
+    assert result is not None
+    before = sorted(home.rglob("*"))
+    for place in ("results", "results/more", "count", result.folder / "exports"):
+        with pytest.raises(RequestError, match=r"results of the workspace .*/w, .* -o"):
+            Store(home / place).create()
+        with pytest.raises(RequestError, match="another folder"), results_in(home / place):
+            pass
+    assert sorted(home.rglob("*")) == before
+    for place in ("dicom", "more", "register/old"):
+        with results_in(home / place):
+            assert (home / place).is_dir()
+    Store(home / "more").create()
+    assert set(run().values()) == {"cached"}
 
 
 def put_beside_scratch(store: Store, value: int) -> Result:
