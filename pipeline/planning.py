@@ -11,7 +11,7 @@ from shlex import quote
 from typing import Any
 
 from pipeline import installed
-from pipeline.config import Config, flattened, result_fields
+from pipeline.config import Config, flattened, result_fields, yaml_value
 from pipeline.errors import PipelineError, RequestError, StageError, nearest
 from pipeline.files import canonical_json, sha256_text
 from pipeline.stage import Stage, get_stage, usable_stages
@@ -438,4 +438,5 @@ def _explain_sources(old: Mapping[str, str], new: Mapping[str, str]) -> list[str
 
 
 def _show(flat: Mapping[str, Any], name: str) -> str:
-    return repr(flat[name]) if name in flat else "(absent)"
+    """A value of a setting, as one would type it."""
+    return yaml_value(flat[name]) if name in flat else "(absent)"

@@ -126,7 +126,7 @@ class Runner:
                 action, reasons = ("would run", ["--force"]) if forced else ("cached", [])
             else:
                 action = "unknown" if stage.state == "pending" else "would run"
-                reasons = stage.reasons
+                reasons = [*stage.reasons, *(["goes on from its checkpoint"] * stage.resumable)]
             last = stage.result or self.store.current(stage.name)
             figures = {"wall_seconds": last.manifest["wall_seconds"]} if last else {}
             found.append(

@@ -89,6 +89,9 @@ def test_status_tells_of_a_checkpoint(toys: Path) -> None:
     call(toys, *RUN, "--set", "count.fail=interrupt")
     (line,) = (e for e in call(toys, "status", "-w", "w").stdout.splitlines() if "count " in e[:6])
     assert line.split(maxsplit=2)[2].strip() == "goes on from its checkpoint"
+    foreseen = call(toys, *RUN, "--dry-run", "--set", "count.fail=interrupt").stdout.splitlines()
+    (line,) = (entry for entry in foreseen if entry.startswith("count "))
+    assert "would run" in line and line.endswith("goes on from its checkpoint")
 
 
 @pytest.mark.parametrize(

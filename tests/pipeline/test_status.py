@@ -25,6 +25,9 @@ def test_names_the_field(run: Any, toys: Path) -> None:
     asked = states(toys, "scale.factor=3")
     assert asked["scale"] == ("stale", ["scale.factor 2.0 → 3.0"])
     assert asked["count"] == ("pending", ["depends on scale"])
+    asked = states(toys, "scale.round=true", "count.fail=null and void")
+    assert asked["scale"] == ("stale", ["scale.round false → true"])
+    assert states(toys, "count.fail=no way")["count"][1] == ["count.fail '' → no way"]
     run("scale.factor=3")
     assert states(toys)["scale"] == ("cached", ["scale.factor 2.0 → 3.0"])
     assert states(toys)["count"] == ("cached", ["input numbers (from scale) changed"])

@@ -72,9 +72,7 @@ def decode_dicom(data: bytes) -> Photo:
         raise
     except Exception as error:  # what damaged files raise in pydicom is anybody's guess
         # Its text may quote the file: it is not told.
-        raise UnusableFile(
-            f"is a DICOM file that is damaged, and can't be decoded ({type(error).__name__})"
-        ) from error
+        raise UnusableFile("is a DICOM file that is damaged, and can't be decoded") from error
 
 
 def _decode(data: bytes) -> Photo:
