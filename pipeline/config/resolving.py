@@ -102,6 +102,7 @@ def load_config(
 def result_fields(config: BaseModel) -> dict[str, Any]:
     """The config fields that can change the result, as JSON values: what enters the key."""
     kept: dict[str, Any] = {}
+    dumped = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         extra = field.json_schema_extra
         if isinstance(extra, dict) and extra.get("affects_result") is False:
@@ -112,10 +113,9 @@ def result_fields(config: BaseModel) -> dict[str, Any]:
             continue
         if isinstance(value, BaseModel):
             kept[name] = result_fields(value)
-            continue
-        dumped = config.model_dump(mode="json")[name]
-        # a set has another order in every process
-        kept[name] = sorted(dumped, key=repr) if isinstance(value, Set) else dumped
+        else:  # a set has another order in every process
+            plain = dumped[name]
+            kept[name] = sorted(plain, key=repr) if isinstance(value, Set) else plain
     return kept
 
 

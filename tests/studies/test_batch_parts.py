@@ -107,29 +107,6 @@ def test_what_lies_in_a_folder_of_cases(tmp_path: Path) -> None:
     assert "2 films" in reasons["films"]
 
 
-def test_what_runs_have_made_is_no_case(tmp_path: Path) -> None:
-    for name in ("workspace", "workspace with photographs", "workspace around photographs"):
-        (tmp_path / name / "fit").mkdir(parents=True)
-        for file in ("request.json", "report.html", "fit/current.json"):
-            (tmp_path / name / file).write_text("{}")
-        pictures(tmp_path / name / "fit" / "0123456789ab" / "renders")
-        pictures(tmp_path / name / "results")
-    pictures(tmp_path / "workspace with photographs")
-    pictures(tmp_path / "workspace around photographs" / "photos")
-    pictures(tmp_path / "passed on" / "results")
-    (tmp_path / "passed on" / "results" / "scene.json").write_text("{}")
-    pictures(tmp_path / "batch" / "thumbnails")
-    pictures(tmp_path / "batch" / "cases" / "a" / "results")
-    for file in ("batch.json", "cases/a/request.json"):
-        (tmp_path / "batch" / file).write_text("{}")
-    found = {case.name: case for case in find_cases(tmp_path, Names({}))}
-    assert {name: case.settled for name, case in found.items()} == {
-        "workspace with photographs": "", "workspace around photographs": "",
-        "workspace": "skipped", "passed on": "skipped", "batch/cases/a": "skipped",
-    }  # fmt: skip
-    assert "what they made" in found["workspace"].reason
-
-
 def test_many_foreign_files_are_counted(tmp_path: Path) -> None:
     pictures(tmp_path / "a")
     for number in range(MOST_FOREIGN + 7):

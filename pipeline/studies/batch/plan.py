@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,6 +28,9 @@ from pipeline.studies.batch.records import (
 from pipeline.studies.batch.sources import settings_of, with_others
 from pipeline.untrusted.own import BATCH
 
+#: Seconds that a plan takes without a word.
+PATIENCE = 2.0
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -38,6 +43,7 @@ class Plan:
         waiting: those that are to be run.
         retried: ids of those that are run again though they came to an end.
         asked: what it was made from.
+        earlier: names of the cases that were known before.
     """
 
     cases: list[Case]
@@ -46,10 +52,15 @@ class Plan:
     waiting: list[Case]
     retried: set[str]
     asked: tuple[Any, ...]
+    earlier: Mapping[str, str]
 
     def again(self) -> Plan:
-        """The same plan, made anew."""
-        return make_plan(*self.asked)
+        """The same plan, with what another batch has done meanwhile."""
+        _, out, *_, retry, keep, _ = self.asked
+        if _earlier(out) != self.earlier:
+            return make_plan(*self.asked)
+        records, waiting, retried = _standing(self.cases, self.settings, out, retry, keep)
+        return replace(self, records=records, waiting=waiting, retried=retried)
 
 
 def make_plan(
@@ -60,8 +71,12 @@ def make_plan(
     stages: tuple[str, ...] | None,
     retry: Sequence[str],
     keep: str = "workspace",
+    tell: Callable[[str], None] = lambda message: None,
 ) -> Plan:
     """Find the cases and what is known of them; nothing is written.
+
+    Args:
+        tell: hears of it where that takes a while.
 
     Raises:
         RequestError: a setting, the place, or a name to retry is wrong, or there is no case.
@@ -74,10 +89,15 @@ def make_plan(
             f"The results would lie in {out}, among the cases themselves. Choose a folder outside "
             f"{place}: -o."
         )
-    names = Names(_earlier(out))
+    earlier = _earlier(out)
+    names = Names(earlier)
+    said = time.monotonic()
     cases = find_cases(place, names) if place.is_dir() else _listed(place, names)
     settings: dict[str, str] = {}
     for number, case in enumerate(cases):
+        if time.monotonic() > said + PATIENCE:
+            said = math.inf
+            tell(f"Looking at the settings and photographs of {len(cases)} cases, once.")
         try:
             found = settings_for(preset, overrides + case.overrides, stages)
         except RequestError as error:
@@ -92,6 +112,15 @@ def make_plan(
         raise RequestError(
             f"There is no case in {place}. It should hold a folder of photographs for each case."
         )
+    records, waiting, retried = _standing(cases, settings, out, retry, keep)
+    asked = (place, out, preset, overrides, stages, retry, keep, tell)
+    return Plan(cases, settings, records, waiting, retried, asked, earlier)
+
+
+def _standing(
+    cases: Sequence[Case], settings: Mapping[str, str], out: Path, retry: Sequence[str], keep: str
+) -> tuple[dict[str, dict[str, Any]], list[Case], set[str]]:
+    """How the cases stand by their records: `Plan.records`, `Plan.waiting` and `Plan.retried`."""
     records: dict[str, dict[str, Any]] = {}
     waiting = []
     retried = _retried(cases, out, retry)
@@ -109,8 +138,7 @@ def make_plan(
         else:
             records[case.id] = new_record(case, "waiting")
             waiting.append(case)
-    asked = (place, out, preset, overrides, stages, retry, keep)
-    return Plan(cases, settings, records, waiting, retried, asked)
+    return records, waiting, retried
 
 
 def check_folder(out: Path, place: Path, cases: Sequence[Case], *, chosen: bool) -> None:

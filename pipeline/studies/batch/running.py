@@ -100,14 +100,16 @@ def batch(
         "threads": 0 if scheduler else max(1, usable_cores() // jobs),
         "verbose": progress.verbose,
     }  # fmt: skip
-    plan = make_plan(place, folder, common["preset"], texts, named, retry, keep)
+    plan = make_plan(
+        place, folder, common["preset"], texts, named, retry, keep, progress.message
+    )  # fmt: skip
     check_folder(folder, place, plan.cases, chosen=out is not None)
     wait = "Wait for it (its summary.html shows how far it is)"
     alone = only_one(folder.absolute(), "batch", FOLDERS, wait)
     with kept_for(share_for(folder, share)), alone as home:
         for name in FOLDERS:
             stage_folder(home, name)
-        plan = plan.again()  # what another batch has done meanwhile
+        plan = plan.again()
         check_folder(folder, place, plan.cases, chosen=out is not None)
         session, version = uuid.uuid4().hex, library_version("dentalsplat")
         found = {"id": session, "version": version, "cases": str(place.resolve())}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pipeline.config import load_config, result_fields
 from pipeline.files import canonical_json, sha256_text
-from pipeline.installed import ROOT, library_version
-from pipeline.planning import resolve_chain
+from pipeline.installed import ROOT
+from pipeline.planning import library_version, resolve_chain
 from pipeline.stage import StageConfig, get_stage
 from pipeline.store import Store
 from pipeline.studies.batch.records import Case, Other
