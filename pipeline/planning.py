@@ -424,6 +424,25 @@ def explain(
     return reasons
 
 
+def changed_sources(
+    name: str, config: Config, store: Store, images: Sequence[str | Path]
+) -> list[str]:
+    """What has become of the user's files since a stage read them; nothing where they are away, or
+    where it read them with other settings."""
+    stage, result = usable_stages().get(name), store.current(name)
+    if stage is None or not stage.uses_sources or result is None:
+        return []
+    if not _read_as_set(name, config, store, ()):
+        return []
+    request = {"images": list(images), "workspace": store.root}
+    try:
+        found = stage.sources(config.sections[name], request)
+        now = {label: _hash_source(label, path) for label, path in found.items()}
+    except RequestError:
+        return []
+    return _explain_sources(dict(result.manifest["key_material"]["sources"]), now)
+
+
 def _explain_sources(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
     reasons = []
     for verb, labels in (

@@ -14,6 +14,7 @@ from pipeline.measure import Measurement
 from pipeline.planning import (
     PlannedStage,
     Providers,
+    changed_sources,
     plan_chain,
     plan_stage,
     resolve_chain,
@@ -145,6 +146,11 @@ class Runner:
                 self.reporter.message(
                     f"The settings given for '{name}' change nothing in this run: its result in "
                     f"use is taken as it is. Run with --from {name} to have it made with them."
+                )
+            if changed := changed_sources(name, self.config, self.store, self.request.images):
+                self.reporter.message(
+                    f"Since '{name}' read the photographs: {'; '.join(changed)}. What it read then "
+                    f"is used. Name them, or run with --from {name}, to have them read again."
                 )
         for name in self.chain.standing:
             result = self.store.current(name)

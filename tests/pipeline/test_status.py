@@ -12,6 +12,7 @@ import toy
 import pipeline
 from pipeline.front.progress import LineReporter
 from pipeline.planning import key_material
+from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
 
 
@@ -39,6 +40,26 @@ def test_names_the_input_file(run: Any, toys: Path) -> None:
     assert states(toys)["read"] == ("stale", ["input file changed: 1.txt"])
     (toys / "images" / "9.txt").write_text("7")
     assert states(toys)["read"][1] == ["input file added: 9.txt", "input file changed: 1.txt"]
+
+
+def test_a_run_says_that_what_it_takes_as_it_is_has_changed(run: Any, toys: Path) -> None:
+    """As status does: without the photographs named a run does not read them again."""
+    heard: list[str] = []
+    ears = Reporter()
+    ears.message = heard.append  # type: ignore[method-assign]
+    run()
+    run(images=(), reporter=ears)
+    assert not any("Since" in text for text in heard)
+    (toys / "images" / "1.txt").write_text("7")
+    (toys / "images" / "2.txt").unlink()
+    assert set(run(images=(), reporter=ears).values()) == {"cached"}
+    (said,) = (text for text in heard if text.startswith("Since 'read' read"))
+    assert "input file removed: 2.txt; input file changed: 1.txt." in said
+    assert run(images=(), from_stage="read", reporter=ears)["read"] == "ran"
+    (toys / "images").rename(toys / "away")
+    heard.clear()
+    assert set(run(images=(), reporter=ears).values()) == {"cached"}
+    assert not any("Since" in text for text in heard)
 
 
 def test_names_library_seed_and_version(
