@@ -87,10 +87,12 @@ def setting(incomplete: str) -> list[tuple[str, str]]:
 
 
 def _words(allowed: str) -> Iterator[str]:
-    """Those values that are single words: ``auto | mouth | upright``, ``true or false``."""
-    if allowed == "true or false":
-        yield from ("true", "false")
-    else:
-        for part in allowed.split(" | "):
-            if part.isidentifier() and part not in ("text", "path", "number", "null"):
-                yield part
+    """Those values that are single words: ``auto | mouth | upright``, ``true or false``.
+
+    Not the entries of a list: ``auto | list: light | flow``.
+    """
+    for part in allowed.partition("list")[0].split(" | "):
+        if part == "true or false":
+            yield from ("true", "false")
+        elif part.isidentifier() and part not in ("text", "path", "number", "null"):
+            yield part

@@ -34,6 +34,9 @@ def test_settings() -> None:
     assert [name for name, _ in completion.setting("export.mesh=")] == [
         "export.mesh=true", "export.mesh=false",
     ]  # fmt: skip
+    assert completion.setting("init.dental.order=") == [], "a list is more than one of its words"
+    assert completion.setting("fit.parts=") == [("fit.parts=auto", "")]
+    assert len(completion.setting("fit.densify=")) == 3, "auto, true and false"
     assert completion.setting("nosuch.x") == []
 
 
