@@ -236,6 +236,22 @@ def test_a_folder_holds_one_study(tmp_path: Path) -> None:
     assert read(out, "preview.dcm").PatientID == "A"
 
 
+@pytest.mark.parametrize("named", ["", "*.jpg", "1.jpg"])
+def test_no_file_is_put_among_the_photographs(
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next run would take it for one."""
+    monkeypatch.setattr(writing, "exports_of", lambda case: case.workspace / "results")
+    folder, photographs = workspace(tmp_path / "w"), tmp_path / "photographs"
+    photographs.mkdir()
+    (photographs / "1.jpg").write_bytes(b"a photograph")
+    Request(folder, (str(photographs / named),), None, (), None).save()
+    with pytest.raises(RequestError, match="holds the photographs of this run"):
+        write_dicom(folder, photographs, views=0)
+    assert len(list(photographs.iterdir())) == 1
+    assert write_dicom(folder, photographs / "dicom", views=0).files
+
+
 def test_a_run_that_failed_before_its_exports_is_refused(tmp_path: Path) -> None:
     folder = workspace(tmp_path / "w")
     Failures(folder).record("evaluate", "key", "after the exports")

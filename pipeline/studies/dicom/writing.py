@@ -63,6 +63,7 @@ def write_all(
             f"first: pipeline run -w {quote(str(workspace))}"
         )
     scale = Scale.from_dict(scene.get("scale") or {})  # none in exports of before it was recorded
+    _keep_apart(folder, case.request["images"])
     solids, left_out = _solids(results, scale, scene.get("frame", {}), unscaled)
     with results_in(folder):
         pictures = [*_preview(results), *_views(case, views)]
@@ -87,6 +88,21 @@ def write_all(
     titles |= {solid.name: solid.title for solid in solids}
     removed = tuple(name for name in before if name not in made)
     return Written(folder, titles, left_out, tuple(problems), removed)
+
+
+def _keep_apart(folder: Path, images: Iterable[str]) -> None:
+    """Nothing is written where the run's photographs lie: it would be one of them the next time.
+
+    Raises:
+        RequestError: they lie there.
+    """
+    for image in map(Path, images):
+        place = image if image.is_dir() else image.parent
+        if place.resolve() == folder.resolve():
+            raise RequestError(
+                f"{folder} holds the photographs of this run, and the next one would take DICOM "
+                "files there for photographs as well. Name another folder with -o."
+            )
 
 
 def _solids(
