@@ -20,6 +20,8 @@ _NAMES = {
     "check.html", "teeth.yaml", "logs", "profile", "compare", "dicom", "register",
     "cells", "results.json", "tables.md", "tables.csv", BATCH, "summary.csv", "summary.html",
 }  # fmt: skip
+#: Files that are written into `dicom`, where an archive's photographs may lie instead.
+_DICOM_FILES = ("preview.dcm", "view_[0-9][0-9][0-9].dcm", "mesh*.dcm", "model*.dcm")
 #: Folders of a batch that hold no cases and whose names are not ours alone.
 _OF_A_BATCH = {"records", "thumbnails"}
 
@@ -39,6 +41,13 @@ def is_own(path: Path) -> bool:
     return path.is_dir() and any(os.path.lexists(path / name) for name in (LOCK, POINTER))
 
 
+def is_made(path: Path) -> bool:
+    """Is something, where runs keep what they made, of that, and no folder of photographs?"""
+    if path.name == "dicom" and not any(any(path.glob(files)) for files in _DICOM_FILES):
+        return False
+    return is_own(path)
+
+
 def made_around(path: Path) -> Iterator[Path]:
     """The folders that a file lies in of those that hold what runs have made."""
-    return (folder for folder in path.parents if has_results(folder.parent) and is_own(folder))
+    return (folder for folder in path.parents if has_results(folder.parent) and is_made(folder))

@@ -14,7 +14,7 @@ from pipeline.errors import RequestError, nearest
 from pipeline.untrusted.files import PHOTOGRAPH, UnusableFile, opened, sort_of
 from pipeline.untrusted.films import KNOWN as KNOWN_FILMS
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.own import has_results, is_own, made_around
+from pipeline.untrusted.own import has_results, is_made, made_around
 from pipeline.untrusted.paths import matching, names_folder
 from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
 from stages.views.sampling import natural_key
@@ -287,7 +287,7 @@ def _expand_folder(folder: Path) -> list[Path]:
         inside = [
             entry.path
             for entry in entries
-            if entry.is_folder and not (with_results and is_own(entry.path))
+            if entry.is_folder and not (with_results and is_made(entry.path))
             and any(is_photograph(e.path) for e in _try_list(entry.path))
         ]  # fmt: skip
         if with_results and not inside:

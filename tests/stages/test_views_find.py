@@ -169,6 +169,11 @@ def test_a_workspace_in_place_of_photographs(tmp_path: Path) -> None:
         find_images([own])
     touch(own, "1.png")
     assert list(find_images([own])) == ["1.png"]
+    touch(own, "dicom/1.dcm")  # an archive's, beside what runs have made
+    assert list(find_images([tmp_path / "**" / "*.dcm"])) == ["1.dcm"]
+    (own / "dicom" / "1.dcm").rename(own / "dicom" / "preview.dcm")
+    with pytest.raises(RequestError, match="only what earlier runs have made"):
+        find_images([tmp_path / "**" / "*.dcm"])
 
 
 def test_equal_names_get_their_folders(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pipeline.studies.batch.records import Case
 from pipeline.studies.batch.sources import contents_of
 from pipeline.untrusted.files import sort_of
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.own import has_results, is_own
+from pipeline.untrusted.own import has_results, is_made
 from pipeline.workspace import GENERIC_FOLDERS
 
 #: Folders of folders of cases (a clinic, a year, a patient) are gone through this deep.
@@ -269,7 +269,7 @@ def _entries(folder: Path) -> list[tuple[Path, str]]:
     with_results = has_results(folder)
     for name in sorted(os.listdir(folder), key=natural_key):  # noqa: PTH208
         path = folder / name
-        if with_results and is_own(path):
+        if with_results and is_made(path):
             continue
         try:
             mode = path.stat().st_mode
