@@ -249,12 +249,12 @@ def default_workspace(images: Sequence[str | Path]) -> Path:
         raise RequestError("Give the photographs (a folder, files or a video), or a workspace: -w.")
     first = Path(images[0])
     single = len(images) == 1
-    if single and first.is_dir():
+    if single and os.path.isdir(first):  # noqa: PTH112 - of a closed folder, it is told later
         folder = first.resolve()
-    elif single and not any(c in first.name for c in "*?["):
+    elif single and (os.path.exists(first) or not any(c in str(first) for c in "*?[")):  # noqa: PTH110
         return Path("runs") / printable(first.stem)
-    else:
-        folder = first.resolve().parent
+    else:  # a pattern may begin with the folders
+        folder = next(p for p in first.resolve().parents if os.path.isdir(p))  # noqa: PTH112
     name = folder.parent.name if folder.name.lower() in GENERIC_FOLDERS else folder.name
     return Path("runs") / (printable(name) or "case")
 

@@ -85,6 +85,17 @@ def test_the_default_workspace_has_a_plain_name(odd: Path) -> None:
     assert default_workspace([odd]).name == "caf\\xe9 [b] 🦷"
 
 
+def test_the_default_workspace_of_a_pattern_has_no_stars(tmp_path: Path) -> None:
+    """``runs/**`` is a folder that nobody wants to delete."""
+    (tmp_path / "anna" / "photos").mkdir(parents=True)
+    (tmp_path / "anna" / "photos" / "a [1].jpg").write_bytes(b"x")
+    for pattern in ("*.jpg", "**/*.jpg", "p*/*.jpg", "p*/a.jpg", "photos/?.jpg"):
+        assert default_workspace([tmp_path / "anna" / pattern]) == Path("runs", "anna")
+        assert default_workspace([tmp_path / "anna" / pattern, "x"]) == Path("runs", "anna")
+    one = tmp_path / "anna" / "photos" / "a [1].jpg"
+    assert default_workspace([one]) == Path("runs", "a [1]")
+
+
 def test_a_run_in_this_process(odd: Path) -> None:
     workspace = odd / "w"
     pipeline.run(odd, workspace=workspace, stages=["views"])
