@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.errors import RequestError
 from pipeline.studies.batch import plan
 from pipeline.studies.batch.find import Names, find_cases
 from pipeline.studies.batch.records import new_record, write_case
@@ -41,6 +42,27 @@ def test_what_runs_have_made_is_no_case(tmp_path: Path) -> None:
         "workspace": "skipped", "passed on": "skipped", "batch/cases/a": "skipped",
     }  # fmt: skip
     assert "what they made" in found["workspace"].reason
+
+
+def test_what_goes_with_photographs_is_no_case(tmp_path: Path) -> None:
+    """Also where these lie where folders of cases were to lie."""
+    pictures(tmp_path)
+    pictures(tmp_path / "Masks")
+    pictures(tmp_path / "depth")
+    pictures(tmp_path / "@eaDir")
+    with pytest.raises(RequestError, match="holds photographs itself, so it is one case"):
+        find_cases(tmp_path, Names({}))
+    pictures(tmp_path / "anna")
+    found = {case.name: case.settled for case in find_cases(tmp_path, Names({}))}
+    assert found == {
+        "anna": "", "Masks": "skipped", "depth": "skipped", "0.jpg": "skipped", "1.jpg": "skipped",
+        "@eaDir": "skipped",
+    }  # fmt: skip
+    (tmp_path / "0.jpg").unlink()
+    (tmp_path / "1.jpg").unlink()
+    found = {case.name: case.settled for case in find_cases(tmp_path, Names({}))}
+    found.pop("@eaDir")
+    assert found == {"anna": "", "Masks": "", "depth": ""}, "beside no photographs: names of cases"
 
 
 def test_a_list_is_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,7 +86,10 @@ def find_cases(place: Path, names: Names) -> list[Case]:
             f"The cases {place} can't be read ({error.strerror or error}). Give a folder that "
             "holds a folder of photographs for each case, or a CSV file."
         ) from error
-    kinds = [kind for _, kind in entries]
+    kinds = [
+        kind for path, kind in entries
+        if not (kind == "folder" and (_goes_with(path) or _out_of_sight(path)))
+    ]  # fmt: skip
     if "folder" not in kinds and "picture" in kinds:
         raise RequestError(
             f"{place} holds photographs itself, so it is one case. A batch is given the folder "
@@ -157,9 +160,15 @@ def _walk(
 ) -> Iterator[Case]:
     """What a folder of folders holds."""
     foreign = 0
+    entries = _entries(folder)
+    pictures = any(kind == "picture" for _, kind in entries)
     # Links come last: a folder is called as it is itself, not as a link to it.
-    for path, kind in sorted(_entries(folder), key=lambda entry: entry[0].is_symlink()):
+    for path, kind in sorted(entries, key=lambda entry: entry[0].is_symlink()):
         called = printable(str(path.relative_to(root)))
+        if kind == "folder" and pictures and _goes_with(path):
+            why = "A folder that goes with the photographs beside it: not looked into."
+            yield Case("", called, settled="skipped", reason=why)
+            continue
         if kind == "folder":
             yield from _folder(root, path, called, above, seen)
             continue
@@ -228,6 +237,10 @@ def _folder(
         yield as_case(called, [folder])  # which says what it holds instead
 
 
+def _goes_with(folder: Path) -> bool:
+    return folder.name.lower() in BESIDE
+
+
 def _out_of_sight(folder: Path) -> str:
     """What a folder is that people don't put photographs into; empty: not such a one."""
     if folder.name.startswith("."):
@@ -238,7 +251,7 @@ def _out_of_sight(folder: Path) -> str:
 def _leaf(
     folder: Path, called: str, pictures: list[Path], films: list[Path], inner: list[Path]
 ) -> Case:
-    more = [path for path in inner if path.name.lower() not in BESIDE and _holds_pictures(path)]
+    more = [path for path in inner if not _goes_with(path) and _holds_pictures(path)]
     if more:
         why = (
             f"It holds photographs and also a folder of photographs ({printable(more[0].name)}): "
