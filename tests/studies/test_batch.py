@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -20,6 +21,7 @@ import pytest
 from pipeline.artifacts import KINDS
 from pipeline.errors import RequestError
 from pipeline.stage import get_stage
+from pipeline.studies.batch.progress import Lines
 from pipeline.studies.batch.summary import COLUMNS
 from tests.studies import toy_batch
 from tests.studies.small_batch import wait_for
@@ -132,8 +134,9 @@ def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> N
     assert "more memory" in found["big"]["reason"] and "--memory" in found["big"]["reason"]
     assert found["dies"]["attempts"] == 3 and "3 times" in found["dies"]["reason"]
     assert computed(tmp_path)["views"] == 5  # the store had it for the second try
-    again = run("cases.csv", memory=0.4)
+    again = run("cases.csv", memory=0.4, progress=Lines(said := io.StringIO()))
     assert computed(tmp_path) == {} and again == found
+    assert "4 of 6 cases went wrong before and are not run again; --retry" in said.getvalue()
     run("cases.csv", memory=0.4, retry=["bug"])
     assert computed(tmp_path) == {"fit": 1}
     with pytest.raises(

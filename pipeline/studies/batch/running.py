@@ -25,6 +25,7 @@ from pipeline.studies.batch.keep import thumbnail_of
 from pipeline.studies.batch.plan import Plan, check_folder, make_plan
 from pipeline.studies.batch.progress import Lines, Silent, by_state
 from pipeline.studies.batch.records import (
+    FAILED,
     FOLDERS,
     Case,
     new_record,
@@ -164,6 +165,12 @@ class _Work:
         finished = sum(record["state"] == "done" for record in self._records.values())
         if finished:
             self._progress.message(f"{finished} of {len(self._records)} cases are done already")
+        ended = [case.id for case in self._plan.cases if not case.settled]
+        if failed := sum(self._records[case]["state"] in FAILED for case in ended):
+            self._progress.message(
+                f"{failed} of {len(self._records)} cases went wrong before and are not run again; "
+                "--retry failed does that"
+            )
         for record in self._records.values():
             if record["state"] in ("skipped", "duplicate", "wrong"):
                 self._progress.message(f"{record['name']}: {record['state']}: {record['reason']}")
