@@ -12,9 +12,13 @@ SHORTEST_SEQUENCE = 6
 
 
 def natural_key(name: str) -> tuple[tuple[tuple[int, int, str], ...], str]:
-    """Sort key under which ``img.png`` < ``img2.png`` < ``img10.png``; ties by the name itself."""
-    stem, dot, _ = name.casefold().rpartition(".")
-    parts = re.findall(r"[0-9]+|[^0-9]+", stem if dot else name.casefold())
+    """Sort key under which ``img.png`` < ``img2.png`` < ``img10.png``; ties by the name itself.
+
+    What comes last counts where it is a number, as in DICOM's ``1.2.840.9`` < ``1.2.840.10``.
+    """
+    stem, dot, suffix = name.casefold().rpartition(".")
+    named = dot and not suffix.isdigit()
+    parts = re.findall(r"[0-9]+|[^0-9]+", stem if named else name.casefold())
     return tuple((0, int(p), "") if p[0] in "0123456789" else (1, 0, p) for p in parts), name
 
 

@@ -51,6 +51,8 @@ def test_natural_order() -> None:
 
 def test_natural_order_of_odd_digits() -> None:
     assert sorted(["a².png", "a1.png"], key=natural_key) == ["a1.png", "a².png"]
+    archive = ["1.2.840.100", "1.2.840.10", "1.2.840.9"]
+    assert sorted(archive, key=natural_key) == archive[::-1]
 
 
 @pytest.mark.parametrize(
