@@ -15,7 +15,7 @@ from pipeline.config import Config, flattened, result_fields, yaml_value
 from pipeline.errors import PipelineError, RequestError, StageError, nearest
 from pipeline.files import canonical_json, sha256_text
 from pipeline.stage import Stage, get_stage, usable_stages
-from pipeline.store import Result, Store
+from pipeline.store import MANIFEST, Result, Store
 from pipeline.untrusted.files import ANY, UnusableFile, opened
 
 
@@ -428,19 +428,22 @@ def changed_sources(
     name: str, config: Config, store: Store, images: Sequence[str | Path]
 ) -> list[str]:
     """What has become of the user's files since a stage read them; nothing where they are away, or
-    where it read them with other settings."""
+    where it read them with other settings. Only those that the disk says have changed are read."""
     stage, result = usable_stages().get(name), store.current(name)
     if stage is None or not stage.uses_sources or result is None:
         return []
     if not _read_as_set(name, config, store, ()):
         return []
     request = {"images": list(images), "workspace": store.root}
+    before: dict[str, str] = dict(result.manifest["key_material"]["sources"])
     try:
         found = stage.sources(config.sections[name], request)
-        now = {label: _hash_source(label, path) for label, path in found.items()}
-    except RequestError:
+        written = (result.folder / MANIFEST).stat().st_mtime_ns
+        new = [k for k, path in found.items() if path.stat().st_ctime_ns > written]
+        changed = {k: _hash_source(k, found[k]) for k in new if k in before}
+    except (RequestError, OSError):
         return []
-    return _explain_sources(dict(result.manifest["key_material"]["sources"]), now)
+    return _explain_sources(before, {k: changed.get(k, before.get(k, "")) for k in found})
 
 
 def _explain_sources(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
