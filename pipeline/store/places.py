@@ -73,7 +73,7 @@ def check_place(folder: Path) -> None:
     Raises:
         RequestError: it is one, or lies in one.
     """
-    there = folder.resolve()
+    there = Path(os.path.realpath(folder))  # which a link in a circle does not stop
     for place in (there, *there.parents, folder.absolute()):
         computed = place.name == RESULTS or is_there(place / POINTER)
         if computed and has_results(place.parent):

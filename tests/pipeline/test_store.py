@@ -212,6 +212,12 @@ def test_nothing_else_is_put_among_results(run: Any, toys: Path) -> None:
         with results_in(home / place):
             assert (home / place).is_dir()
     Store(home / "more").create()
+    (home / "circle").symlink_to("circle")
+    with (
+        pytest.raises(RequestError, match="circle can't be written to"),
+        results_in(home / "circle"),
+    ):
+        pass
     assert set(run().values()) == {"cached"}
 
 
