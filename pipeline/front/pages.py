@@ -40,7 +40,7 @@ class DrawnBeside:
     """
 
     def __init__(self, workspace: Path, config: Config, stages: Sequence[str]) -> None:
-        self._workspace = workspace.resolve()
+        self._workspace = Path(os.path.realpath(workspace))
         self._last = stages[-2:] if config.run.report and config.threads > 1 else ()
         self._process: subprocess.Popen[str] | None = None
 

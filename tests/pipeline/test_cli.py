@@ -85,6 +85,13 @@ def test_status_tells_why(toys: Path) -> None:
     assert "depends on scale" in done.stdout
 
 
+def test_a_link_in_a_circle_is_no_workspace(toys: Path) -> None:
+    (toys / "loop").symlink_to("loop")
+    done = call(toys, "run", "images", "-w", "loop", "-c", "toy.yaml")
+    assert done.returncode == 2 and "loop can't be written to" in done.stderr
+    assert call(toys, "batch", "images", "-o", "loop").returncode == 2
+
+
 def test_status_tells_of_a_checkpoint(toys: Path) -> None:
     call(toys, *RUN, "--set", "count.fail=interrupt")
     (line,) = (e for e in call(toys, "status", "-w", "w").stdout.splitlines() if "count " in e[:6])

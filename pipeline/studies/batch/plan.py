@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -83,7 +84,7 @@ def make_plan(
     """
     settings_for = lru_cache(maxsize=None)(settings_of)
     settings_for(preset, overrides, stages)  # a wrong setting is refused before anything else
-    out_inside = out.resolve().is_relative_to(place.resolve())
+    out_inside = Path(os.path.realpath(out)).is_relative_to(os.path.realpath(place))
     if out_inside and place.is_dir():
         raise RequestError(
             f"The results would lie in {out}, among the cases themselves. Choose a folder outside "

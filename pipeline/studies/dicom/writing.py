@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import struct
 from collections.abc import Iterable
@@ -98,7 +99,7 @@ def _keep_apart(folder: Path, images: Iterable[str]) -> None:
     """
     for image in map(Path, images):
         place = image if image.is_dir() else image.parent
-        if place.resolve() == folder.resolve():
+        if os.path.realpath(place) == os.path.realpath(folder):
             raise RequestError(
                 f"{folder} holds the photographs of this run, and the next one would take DICOM "
                 "files there for photographs as well. Name another folder with -o."
