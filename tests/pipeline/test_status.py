@@ -67,7 +67,7 @@ def test_names_library_seed_and_version(
 ) -> None:
     run()
     assert states(toys, "seed=5")["read"] == ("stale", ["read seed 0 → 5"])
-    monkeypatch.setattr("pipeline.planning.library_version", lambda name: "0.0.1")
+    monkeypatch.setattr("pipeline.planning.keys.library_version", lambda name: "0.0.1")
     (reason,) = states(toys)["scale"][1]
     assert reason.startswith("library numpy") and reason.endswith("→ 0.0.1")
     monkeypatch.undo()
