@@ -56,9 +56,7 @@ WRONG: list[tuple[Callable[..., Any], tuple[Any, ...], Mapping[str, Any], str]] 
 ]
 
 
-@pytest.mark.parametrize(
-    ("call", "given", "more", "told"), WRONG, ids=lambda value: str(value)[:40]
-)
+@pytest.mark.parametrize(("call", "given", "more", "told"), WRONG)
 def test_what_is_of_the_wrong_kind_is_refused_in_a_sentence(
     call: Callable[..., Any], given: tuple[Any, ...], more: Mapping[str, Any], told: str,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
