@@ -41,7 +41,7 @@ def browse(
         "--disable-background-networking", "--disable-component-update", "--disable-sync",
         "--hide-scrollbars", f"--window-size={size[0]},{size[1]}", "--virtual-time-budget=4000",
         f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *extra,
-        f"file://{file}{address}",
+        f"{file.absolute().as_uri()}{address}",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     return done.stdout, done.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from pipeline.studies.report import run_report
@@ -256,6 +257,17 @@ def test_a_browser_that_keeps_nothing_is_no_error(tmp_path: Path) -> None:
 """
     result = probed(doubtful_case(tmp_path / "case"), tmp_path / "browser", refused)
     assert "tooth: 22" in result["yaml"]
+
+
+@needs_chromium
+def test_what_to_do_next_is_said_in_a_folder_whose_name_is_no_text(tmp_path: Path) -> None:
+    steps = """
+  result.steps = all("#next li").map((entry) => entry.textContent);
+"""
+    workspace = doubtful_case(tmp_path / os.fsdecode(b"caf\xe9"))
+    result = probed(workspace, tmp_path / "browser", SAVE, steps)
+    assert result["steps"][0].startswith("Put it into the workspace folder, beside this page.")
+    assert "pipeline run -w WORKSPACE" in result["steps"][1]
 
 
 def test_what_is_remembered_counts_for_the_pages_own_data(tmp_path: Path) -> None:

@@ -321,9 +321,15 @@ const draw = () => {
 
 // -- saving ----------------------------------------------------------------------------------------
 
+// The folder of this page; "" where it isn't on this machine, or has a name that can't be written here.
 const folder = () => {
-  const path = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
-  return location.protocol === "file:" ? path.replace(/^\/([A-Za-z]:)/, "$1") || "/" : "";
+  if (location.protocol !== "file:") return "";
+  try {
+    const path = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
+    return path.replace(/^\/([A-Za-z]:)/, "$1") || "/";
+  } catch { // bytes that are no UTF-8
+    return "";
+  }
 };
 const save = async () => {
   const text = yamlOf(photos);
@@ -350,8 +356,8 @@ const save = async () => {
   [saved, savedOnce] = [text, true];
   remember();
   const place = folder();
-  const quote = /^[\w./+:-]+$/.test(place) ? place : `'${place.replaceAll("'", "'\\''")}'`;
-  const command = [data.command[0], quote || "WORKSPACE", data.command[1]].join(" ").trim();
+  const written = /^[\w./+:-]+$/.test(place) ? place : `'${place.replaceAll("'", "'\\''")}'`;
+  const command = [data.command[0], place ? written : "WORKSPACE", data.command[1]].join(" ").trim();
   const copy = make("button", { type: "button", onclick: async () => {
     try {
       await navigator.clipboard.writeText(command);
