@@ -235,6 +235,13 @@ SAVED = """(async () => {
   press("m");
   canvas.focus();
   result.bare = await saved();
+  const place = "0,0,-1,0,0,1,.01,.01,3";
+  const texts = [`${"x".repeat(38)}\\u{1f9b7}\\u{1f9b7} and more`, "no letter: \\uffff"];
+  const notes = texts.flatMap((text) => [["n", place], ["text", text]]);
+  location.hash = new URLSearchParams(notes).toString();
+  await until(() => page.state.marks.length === 2);
+  result.notes = await saved();
+  press("Delete"); press("Delete");
   press("u");
   result.numbers = await saved();
   page.render();
@@ -259,6 +266,7 @@ def test_what_is_saved_is_what_is_seen(tmp_path: Path) -> None:
     found, log = run_in(ball_page(), HEAD + SAVED, tmp_path, (640, 480), address="#still")
     assert (found["errors"], log) == ("", [])
     assert found["bare"][0] == 0, "the crosshair is no part of the picture"
+    assert found["notes"][0] > 100, "whatever letters they have"
     count, box = found["numbers"]
     assert count > 100
     assert np.allclose(box, found["where"], atol=6), "numbers are in it where they are on screen"

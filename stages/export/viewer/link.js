@@ -78,9 +78,12 @@ function placeIn(text, limits) {
   };
 }
 
-/** Text of a note without line breaks and control codes, cut to a fair length. */
+/** What no note holds: line breaks, control codes, turned directions, and what is no letter at all. */
+const NO_TEXT = /[\p{Cc}\p{Cs}\p{Noncharacter_Code_Point}\u2028-\u202e\u2066-\u2069]+/gu;
+
+/** Text of a note without what it may not hold, cut to a fair length. */
 function noteText(text) {
-  return [...String(text).replace(/[\u0000-\u001f\u007f-\u009f\u2028-\u202e\u2066-\u2069]+/g, " ")]
+  return [...String(text).replace(NO_TEXT, " ")]
     .slice(0, LONGEST_NOTE).join("").trim();
 }
 

@@ -116,7 +116,8 @@ class Marks {
     const index = store.now.marks.indexOf(mark) + 1;
     const text = markText(mark, scene.scale);
     if (mark.kind === "note") {
-      this.#label(ends[0], `${index}: ${text.length > 40 ? `${text.slice(0, 39)}…` : text}`);
+      const letters = [...text];  // a picture can't hold half of one
+      this.#label(ends[0], `${index}: ${letters.length > 40 ? `${letters.slice(0, 39).join("")}…` : text}`);
     } else if (mark.kind === "angle") {
       this.#label(ends[1], text);
     } else if (ends[0] && ends[1]) {
