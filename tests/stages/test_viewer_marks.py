@@ -106,6 +106,9 @@ DRAWN = """(async () => {
     }
     result.crosshair.push(crosshair());
   }
+  press("d"); press("t");
+  page.setBackground([1, .5, 0]);
+  result.corner = [...page.pixels().subarray(4 * canvas.width - 4, 4 * canvas.width)];
   tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
 })();"""
 
@@ -121,6 +124,7 @@ def test_what_is_drawn_is_of_what_is_there(tmp_path: Path) -> None:
     ], "no numbers of teeth that are cut away"  # fmt: skip
     assert found["slider"] == [[True, "0"], [False, "100"]], "two panes have no photograph"
     assert found["crosshair"] == [True, False, True], "it is there while the keys are the scene's"
+    assert np.allclose(found["corner"], [255, 127.5, 0, 255], atol=1), "no black strip at the tools"
 
 
 ELSEWHERE = """(async () => {

@@ -168,6 +168,14 @@ class SplatRenderer {
     return (distance / Math.min(Math.max(distance, nearest), farthest)) ** globals[1];
   }
 
+  /** The background all over the canvas: panes may leave a part of it. @param {number[]} background */
+  clear(background) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.clearColor(...background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
   /**
    * Draw a pane of the canvas: as many pixels as the pose has, from the pixel `left` on.
    * @param {Pose} pose @param {number[]} background rgb in 0..1

@@ -59,6 +59,7 @@ class Viewer extends Screen {
 
   draw(panes) {
     const shown = this.shownParts();
+    this.renderer.clear(this.backdrop);
     panes.forEach(({ pose, left }, pane) => {
       this.renderer.draw(pose, this.backdrop, shown, { pane, left });
     });
