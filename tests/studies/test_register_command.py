@@ -243,6 +243,7 @@ const found = () => {
   const box = pair.canvas.getBoundingClientRect();
   const told = { state: document.documentElement.dataset.scenes };
   told.stills = getComputedStyle(document.querySelector(".stills")).display;
+  told.says = document.body.innerText.includes("Drag to turn");
   const slide = (value) => {
     by("between").value = value;
     by("between").dispatchEvent(new Event("input"));
@@ -306,6 +307,7 @@ def test_both_scenes_are_live_under_one_slider(page: str, tmp_path: Path) -> Non
 def check_slider(told: dict[str, Any]) -> None:
     assert told["state"] == "live"
     assert told["stills"] == "none"
+    assert told["says"] is True
     assert min(told["first"] + told["second"]) > 0
     assert told["first"] != told["second"], "a tooth has moved"
     assert told["wiped"] == pytest.approx([told["first"][0], told["second"][1]], rel=0.01)
@@ -333,12 +335,14 @@ def test_without_webgl_the_pictures_stay(page: str, tmp_path: Path) -> None:
     script = """visits.ready.then(() => tell({
       state: document.documentElement.dataset.scenes, live: document.getElementById("live").hidden,
       stills: getComputedStyle(document.querySelector(".stills")).display,
+      says: document.body.innerText.includes("Drag to turn"),
       why: document.documentElement.dataset.problem }));"""
     told, log = run_in(blind, script, tmp_path, (1280, 900))
     assert log == []
     assert told["state"] == "pictures"
     assert told["live"] is True
     assert told["stills"] == "grid"
+    assert told["says"] is False, "pictures can't be turned"
     assert "WebGL2" in told["why"]
 
 
