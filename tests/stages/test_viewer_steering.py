@@ -124,6 +124,25 @@ def test_small_windows_have_room_for_everything(tmp_path: Path, size: tuple[int,
     assert found["help"] == [0, True, True], "help begins at its beginning"
 
 
+CHOSEN = """(async () => {
+  await page.ready;
+  const pictures = [...document.querySelectorAll("#views img")];
+  await Promise.all(pictures.map((picture) => picture.decode()));
+  const [row, button] = [$("views"), document.querySelector("#views [aria-pressed=true]")]
+    .map((element) => element.getBoundingClientRect());
+  tell({ place: [row.left, button.left, button.right, row.right], count: pictures.length,
+    narrow: row.width < $("views").scrollWidth });
+})();"""
+
+
+@needs_chromium
+def test_the_view_that_a_phone_begins_with_is_in_sight_among_many(tmp_path: Path) -> None:
+    found, log = run_in(ball_page(4), HEAD + CHOSEN, tmp_path, (320, 640), "#view=9", True)
+    assert log == []
+    assert (found["count"], found["narrow"]) == (12, True)
+    assert found["place"] == sorted(found["place"])
+
+
 PAPER = """(async () => {
   const frames = [];
   requestAnimationFrame = (frame) => frames.push(frame);  // on a busy machine none may come

@@ -52,7 +52,8 @@ def measurement(**changes: Any) -> dict[str, Any]:
 
 
 @cache
-def ball_page() -> str:
+def ball_page(times: int = 1) -> str:
+    """The page of the ball; every photograph is there so many times."""
     ball, cameras = solid_ball(), scene.ball_cameras()
     seen = [render(ball, camera) for camera in cameras]
     surfaces = seen_surfaces(cameras, seen, {})
@@ -73,7 +74,7 @@ def ball_page() -> str:
         mesh=(corners, triangles, np.array([1, 1, 2, 2], np.uint8)),
     )  # fmt: skip
     return build_page(
-        ball, cameras, find_orbit(cameras, [3.0] * 3),
+        ball, cameras * times, find_orbit(cameras * times, [3.0] * 3 * times),
         {camera.name: to_uint8(view.image) for camera, view in zip(cameras, seen, strict=True)},
         rasterizer_constants(ball, cameras), knowledge=knowledge,
     )  # fmt: skip

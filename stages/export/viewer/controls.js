@@ -10,6 +10,7 @@ function addViewButtons(viewer) {
       const picture = document.createElement("img");
       picture.src = view.photo;
       picture.alt = "";
+      picture.style.aspectRatio = view.width / view.height;  // before it is there
       const number = document.createElement("span");
       number.textContent = index + 1;
       button.append(picture, number);
