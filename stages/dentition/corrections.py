@@ -27,7 +27,7 @@ from stages.dentition.crowns import (
     outline_of,
     with_outlines,
 )
-from stages.dentition.parts import perhaps_one
+from stages.dentition.parts import joined_parts, perhaps_one
 from stages.dentition.tooth_rows import number_is_said
 
 Array = npt.NDArray[np.float64]
@@ -154,6 +154,11 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
             upper=tuple(crown for crown in crowns if crown.jaw == "upper"),
             lower=tuple(crown for crown in crowns if crown.jaw == "lower"),
         )
+    # Rows have no place for wisdom teeth: nothing later would find that two parts are one.
+    corrected = joined_parts(
+        corrected,
+        [[_said_wisdom(crown) for crown in corrected.crowns(jaw)] for jaw in JAWS],
+    )  # fmt: skip
     for jaw in JAWS:
         _check_wisdom_teeth(corrected.crowns(jaw), where)
     if not mirrored:
@@ -162,11 +167,16 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
     return replace(turned, kind=photo.kind or turned.kind)
 
 
+def _said_wisdom(crown: Crown) -> int:
+    """The wisdom tooth that a person has said this is, 0: none."""
+    return crown.number if number_is_said(crown) and crown.number % 10 == WISDOM else 0
+
+
 def _check_wisdom_teeth(row: tuple[Crown, ...], where: str) -> None:
     """Refuse a wisdom tooth between others: the row has no place for it, and would go on around."""
     numbered = [crown for crown in row if crown.number]
     for crown in numbered[1:-1]:
-        if number_is_said(crown) and crown.number % 10 == WISDOM:
+        if _said_wisdom(crown):
             raise RequestError(
                 f"{where}: {crown.number} is a wisdom tooth and stands at an end of its row, but "
                 "there are crowns on both sides of this one. Give it another number, or remove "

@@ -132,6 +132,21 @@ def test_a_wisdom_tooth_between_others_is_refused() -> None:
     assert applied(v000=PhotoCorrection(crowns=(between, beyond)))[0].upper[-1].number == 28
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_wisdom_tooth_may_have_been_read_as_two(mirrored: bool) -> None:
+    x, y = case.original(5, "upper")
+    parts = [CrownCorrection((x + side, y), tooth=28) for side in (-9, 9)]
+    split = CrownCorrection((x, y), split=((x, y - 90), (x, y + 90)))
+    photo = PhotoCorrection(crowns=(split, *parts), mirrored=mirrored or None)
+    row = applied(v000=photo)[0].upper
+    assert [crown.number for crown in row].count(28) == 1
+    assert len(row) == 6, "it is one again"
+    whole = case.teeth().views[0].upper[5]
+    one = next(crown for crown in row if crown.number == 28)
+    assert one.doubt == 0.0
+    assert area(one.outline) == pytest.approx(area(whole.outline), rel=0.1)
+
+
 def test_photographs_are_left_out_used_and_called_otherwise() -> None:
     teeth = case.teeth("it is blurred")
     after = applied(
