@@ -147,6 +147,10 @@ ELSEWHERE = """(async () => {
   result.theirs = warned()[0];
   await go(ours);
   result.ours = warned()[0];
+  await go("scene=fewer&camera=1,0,0,0,1,0,0,0,1,0,0,0,4,99");
+  result.camera = warned()[0];
+  await go(`n=0,0,-1,0,0,1,.01,.01,3&text=${"x".repeat(30000)}`);
+  result.long = $("told").textContent;
   tell({ ...result, errors: document.documentElement.dataset.errors ?? "" });
 })();"""
 
@@ -164,6 +168,8 @@ def test_a_link_of_another_scene_is_followed_and_said(tmp_path: Path) -> None:
     assert found["said"].strip().startswith("This link was made in another scene")
     assert found["stays"] == [True, 1], "the marks are still the other scene's"
     assert (found["unsaid"], found["theirs"], found["ours"]) == (False, True, False)
+    assert found["camera"], "so it is where its camera has no photograph here"
+    assert found["long"].startswith("The link is too long to be read")
 
 
 UNSURE = """(async () => {

@@ -27,7 +27,10 @@ function readAddress(viewer, tools) {
   // a link with a camera is of the whole page: what it does not name is as at first
   const whole = camera ? { ...new Store().now, ...state } : state;
   if (Object.keys(whole).length) tools.show(tools.possible(whole));
-  if (camera || state.marks) tools.comesFrom(scene);
+  if (camera || state.marks || scene) tools.comesFrom(scene);
+  if (hash.length > LONGEST_LINK) {
+    tools.tell("The link is too long to be read: what it shows, marks and notes are not there.", 20);
+  }
   if (camera) {
     viewer.stand(camera);
     return true;
