@@ -90,10 +90,11 @@ def test_what_a_person_left_out_is_not_called_unplaced(tmp_path: Path) -> None:
 def test_the_command_is_written_as_a_shell_takes_it(tmp_path: Path) -> None:
     workspace = case.write_case(tmp_path / "w", ("views",))
     asked = json.loads((workspace / "request.json").read_text())
-    asked |= {"images": ["/of/my photos"], "overrides": ["views.held_out=[a.jpg, b.jpg]"]}
+    asked |= {"images": ["/of/my photos", "/of/-x"], "overrides": ["views.held_out=[a.jpg, b.jpg]"]}
     (workspace / "request.json").write_text(json.dumps(asked))
     text = text_of(run_report(workspace).read_text())
-    assert "pipeline run 'my photos' --stages views --set 'views.held_out=[a.jpg, b.jpg]'" in text
+    said = "pipeline run 'my photos' ./-x --stages views --set 'views.held_out=[a.jpg, b.jpg]'"
+    assert said in text
 
 
 def test_names_and_warnings_are_text_and_not_markup(tmp_path: Path) -> None:

@@ -208,6 +208,7 @@ def command(case: Case) -> str:
     """The request as a command line, with names of files instead of their folders."""
     request = case.request
     images = [Path(path).name for path in request.get("images", [])]
+    images = [f"./{name}" if name.startswith("-") else name for name in images]
     if len(images) > MOST_NAMED:
         images = [images[0], "...", images[-1]]
     parts = ["pipeline", "run", *images]
