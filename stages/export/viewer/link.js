@@ -27,11 +27,6 @@ class Store {
     this.now = { ...before, ...changes };
     for (const tell of this.listeners) tell(this.now, before);
   }
-
-  next(key) {
-    const all = CHOICES[key];
-    this.set({ [key]: all[(all.indexOf(this.now[key]) + 1) % all.length] });
-  }
 }
 
 const brief = (number) => String(Number(number.toPrecision(6)));
