@@ -295,7 +295,7 @@ def test_the_summary_takes_any_name_and_stays_small(tmp_path: Path) -> None:
 @needs_chromium
 def test_the_summary_says_how_many_are_found(tmp_path: Path) -> None:
     records = [new_record(Case(f"c{n}", f"case {n}"), "waiting") for n in range(3)]
-    records.append(new_record(Case("x", "x"), "done"))
+    records.append(new_record(Case("x", "Jose\u0301 x"), "done"))  # as macOS writes it
     write_summary(tmp_path, records, "Batch", "")
     script = """
       delete Element.prototype.ariaPressed;  // as in Firefox 115
@@ -308,14 +308,14 @@ def test_the_summary_says_how_many_are_found(tmp_path: Path) -> None:
       };
       const told = [found("case"), found(""), found("no such case")];
       document.querySelector("[data-state=done]").click();
-      tell({ told: [...told, found(" X "), found("case 1")] });"""
+      tell({ told: [...told, found(" X "), found("jos\\u00c9"), found("case 1")] });"""
     page = (tmp_path / "summary.html").read_text()
     told, log = run_in(page, script, tmp_path, (1280, 800))
     assert log == []
     nothing, *_ = told["told"][2]
     assert nothing.startswith("No case found.")
     assert told["told"] == [
-        ["3 of 4 cases", 3], ["", 4], [nothing, 0], ["1 of 4 cases", 1], [nothing, 0],
+        ["3 of 4 cases", 3], ["", 4], [nothing, 0], *[["1 of 4 cases", 1]] * 2, [nothing, 0],
     ]  # fmt: skip
 
 
