@@ -185,6 +185,7 @@ REOPENED = """
     result.own = ids.length === new Set(ids).size;
     press("z", { ctrlKey: true });
 SAVING
+    result.saved = back.textContent.replace(/of .* are/, "of TODAY are");
   }
   if (k === 3) {
     back.querySelector("button").click();
@@ -216,7 +217,8 @@ def test_changes_are_there_when_the_page_is_opened_again(tmp_path: Path) -> None
     unsaved = "Your changes of TODAY are back, not saved in teeth.yaml yet. Discard"
     assert opened[1] == [unsaved, changed, button]
     assert result["own"], "each crown has an id of its own"
-    assert opened[2] == ["Your changes of TODAY are back. Discard", changed, f"{button} again"]
+    assert result["saved"] == "Your changes of TODAY are back. Discard"
+    assert opened[2] == [result["saved"], changed, f"{button} again"]
     assert result["discarded"] == [opened[0][1], True, "undo"]
     assert result["undiscarded"] == changed
     assert opened[3][1] == changed

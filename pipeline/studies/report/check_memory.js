@@ -42,7 +42,7 @@ const recall = () => {
   if (kept.saved) [saved, savedOnce] = [kept.saved, true];
   const date = new Date(kept.on).toLocaleString("en-GB", { dateStyle: "long", timeStyle: "short" });
   find("back").replaceChildren(make("p", {}, `Your changes of ${date} are back`,
-    yamlOf(photos) === saved ? ". " : `, not saved in ${data.file} yet. `,
+    yamlOf(photos) === saved ? null : make("span", {}, `, not saved in ${data.file} yet`), ". ",
     make("button", { type: "button", onclick: discard }, "Discard")));
   find("back").hidden = false;
 };

@@ -354,6 +354,7 @@ const save = async () => {
     how = "downloaded";
   }
   [saved, savedOnce] = [text, true];
+  find("back").querySelector("span")?.remove(); // that they are not saved yet
   remember();
   const place = folder();
   const written = /^[\w./+:-]+$/.test(place) ? place : `'${place.replaceAll("'", "'\\''")}'`;
