@@ -30,6 +30,13 @@ MOST_GAUSSIANS = 10_000_000
 #: Numbers `f_rest_*` of a Gaussian for degrees 0 to 3.
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(4))
 
+#: PlayCanvas's compressed `.ply` bounds so many Gaussians at a time, and writes each within that;
+#: harmonics from minus to plus half of this span fill a byte.
+COMPRESSED_CHUNK, COMPRESSED_HARMONIC_SPAN = 256, 8.0
+#: Its bounds, three each, and its words of a Gaussian.
+COMPRESSED_BOUNDS = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+COMPRESSED_WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
 
 @dataclass(frozen=True)
 class Light:

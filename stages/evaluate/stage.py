@@ -10,10 +10,8 @@ from pipeline.errors import RequestError
 from pipeline.stage import Parts, Stage, StageContext
 from pipeline.untrusted.names import printable
 from pipeline.untrusted.paths import user_path
+from pipeline.untrusted.pictures import SUFFIXES
 from stages.evaluate.config import EvaluateConfig
-
-#: Suffixes of masks.
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class EvaluateStage(Stage):
@@ -80,7 +78,7 @@ def _mask_files(folder: str) -> list[Path]:
             f"evaluate.masks: there is no folder {path}. Give the folder of masks named as the "
             "photographs, 255 where the figures count."
         )
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in _PICTURES)
+    found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
     if not found:
         raise RequestError(f"evaluate.masks: there is no picture in {path}.")
     return found

@@ -12,7 +12,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.gaussians import MOST_GAUSSIANS, REST_COUNTS, SH_COEFFICIENTS
+from pipeline.artifacts.gaussians import (
+    COMPRESSED_BOUNDS,
+    COMPRESSED_CHUNK,
+    COMPRESSED_HARMONIC_SPAN,
+    COMPRESSED_WORDS,
+    MOST_GAUSSIANS,
+    REST_COUNTS,
+    SH_COEFFICIENTS,
+)
 from pipeline.errors import RequestError
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.scenes.ply import CLOUD, Element, read_ply
@@ -21,13 +29,9 @@ from stages.splatting.rendering import CONSTANT_HARMONIC
 Array = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 
-CHUNK = 256
-#: Harmonics from -4 to 4 fill a byte.
-HARMONIC_SPAN = 8.0
 #: The property by which one knows such a file.
-MARK = "packed_position"
-_WORDS = (MARK, "packed_rotation", "packed_scale", "packed_color")
-_PLACES, _SIZES, _COLOURS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+MARK = COMPRESSED_WORDS[0]
+_PLACES, _SIZES, _COLOURS = COMPRESSED_BOUNDS
 
 
 def read_compressed_ply(path: Path) -> dict[str, Array]:
@@ -51,16 +55,18 @@ def _gaussians(found: Mapping[str, Element]) -> dict[str, Array]:
     bounded = (*_PLACES, *_SIZES, *(_COLOURS if "min_r" in chunks.columns else ()))
     bounds = [f"{side}_{name}" for name in bounded for side in ("min", "max")]
     words = {n: column for n, column in vertices.columns.items() if column.dtype.kind == "u"}
-    lacking = [n for n in bounds if n not in chunks.columns] + [n for n in _WORDS if n not in words]
+    lacking = [n for n in bounds if n not in chunks.columns] + [
+        n for n in COMPRESSED_WORDS if n not in words
+    ]
     if lacking:
         raise UnusableFile(f"is no whole compressed .ply: it lacks {', '.join(lacking)}")
-    if chunks.count != -(-count // CHUNK):
+    if chunks.count != -(-count // COMPRESSED_CHUNK):
         raise UnusableFile(f"is damaged: it has {chunks.count} chunks for {count} Gaussians")
     rest = [f"f_rest_{k}" for k in range(len(sh.columns))]
     if sh.count not in (0, count) or len(rest) not in REST_COUNTS or {*rest} != {*sh.columns}:
         raise UnusableFile("is damaged: its harmonics are not those of its Gaussians")
-    position, rotation, scale, color = (words[name].astype(np.uint32) for name in _WORDS)
-    chunk = np.arange(count) // CHUNK
+    position, rotation, scale, color = (words[name].astype(np.uint32) for name in COMPRESSED_WORDS)
+    chunk = np.arange(count) // COMPRESSED_CHUNK
 
     def within(shares: Doubles, names: Sequence[str]) -> Doubles:
         low, high = (
@@ -77,7 +83,7 @@ def _gaussians(found: Mapping[str, Element]) -> dict[str, Array]:
         if sh.count and rest:
             level = np.stack([sh.columns[name] for name in rest], 1).astype(np.float64)
             share = np.where(level == 0, 0, np.where(level == 255, 1, (level + 0.5) / 256))
-            further = ((share - 0.5) * HARMONIC_SPAN).reshape(count, 3, -1)
+            further = ((share - 0.5) * COMPRESSED_HARMONIC_SPAN).reshape(count, 3, -1)
             harmonics[:, 1 : 1 + further.shape[2]] = further.transpose(0, 2, 1)
         fields = {
             "means": within(_unpacked(position, (11, 10, 11)), _PLACES),

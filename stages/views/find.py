@@ -16,13 +16,10 @@ from pipeline.untrusted.films import KNOWN as KNOWN_FILMS
 from pipeline.untrusted.names import printable
 from pipeline.untrusted.own import has_results, is_made, made_around
 from pipeline.untrusted.paths import matching, names_folder
-from pipeline.untrusted.pictures import DICOM_MARK, KNOWN
+from pipeline.untrusted.pictures import DICOM_MARK, KNOWN, SUFFIXES
 from stages.views.sampling import natural_key
 
-IMAGE_SUFFIXES = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp",
-    ".dcm", ".dicom",
-)  # fmt: skip
+IMAGE_SUFFIXES = (*SUFFIXES, ".dcm", ".dicom")
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
     ".m2ts", ".ts",

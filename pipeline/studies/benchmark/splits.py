@@ -10,10 +10,7 @@ import numpy as np
 
 from pipeline.errors import RequestError
 from pipeline.untrusted.paths import matching
-
-PICTURE_SUFFIXES = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp",
-)  # fmt: skip
+from pipeline.untrusted.pictures import SUFFIXES
 
 #: The paper's video protocol (section 4.1).
 VIDEO_FRAMES = 24
@@ -47,7 +44,7 @@ def pictures_of(images: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for place in images:
         if place.is_dir():
-            found += [path for path in place.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+            found += [path for path in place.iterdir() if path.suffix.lower() in SUFFIXES]
         elif place.is_file():
             found.append(place)
         else:
@@ -57,7 +54,7 @@ def pictures_of(images: Sequence[Path]) -> list[Path]:
     found.sort(key=lambda path: natural_key(path.name))
     if not found:
         raise RequestError(
-            f"{where}: no photographs ({', '.join(PICTURE_SUFFIXES)}). A scene of a benchmark is "
+            f"{where}: no photographs ({', '.join(SUFFIXES)}). A scene of a benchmark is "
             "a folder of them; a video must be taken apart into frames first."
         )
     stems = [path.stem for path in found]

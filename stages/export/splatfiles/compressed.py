@@ -11,23 +11,23 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.gaussians import Gaussians, ply_comment
+from pipeline.artifacts.gaussians import (
+    COMPRESSED_BOUNDS,
+    COMPRESSED_CHUNK,
+    COMPRESSED_HARMONIC_SPAN,
+    COMPRESSED_WORDS,
+    Gaussians,
+    ply_comment,
+)
 from stages.export.splats import coefficients, opacity_bytes, smallest_three
 from stages.splatting.rendering import CONSTANT_HARMONIC
 
-CHUNK = 256
 #: Logarithms of sizes beyond this are cut.
 MOST_LOG_SCALE = 20.0
-#: Harmonics from -4 to 4 fill a byte.
-HARMONIC_SPAN = 8.0
 
 CHUNK_PROPERTIES = [
-    f"{side}_{name}"
-    for group in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
-    for side in ("min", "max")
-    for name in group
+    f"{side}_{name}" for group in COMPRESSED_BOUNDS for side in ("min", "max") for name in group
 ]
-PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def compressed_ply_bytes(gaussians: Gaussians, degree: int, comments: Iterable[str] = ()) -> bytes:
@@ -56,10 +56,10 @@ def compressed_ply_bytes(gaussians: Gaussians, degree: int, comments: Iterable[s
     bounds = np.concatenate([low_p, high_p, low_s, high_s, low_c, high_c], 1).astype("<f4")
     further = gaussians.sh[:, 1 : 1 + coefficients(degree)].transpose(0, 2, 1)
     rest = further.reshape(count, 3 * coefficients(degree))
-    shares = np.trunc((rest.astype(np.float64) / HARMONIC_SPAN + 0.5) * 256)
+    shares = np.trunc((rest.astype(np.float64) / COMPRESSED_HARMONIC_SPAN + 0.5) * 256)
     header = ["ply", "format binary_little_endian 1.0", *map(ply_comment, comments)]
     header += [f"element chunk {len(bounds)}", *(f"property float {n}" for n in CHUNK_PROPERTIES)]
-    header += [f"element vertex {count}", *(f"property uint {name}" for name in PROPERTIES)]
+    header += [f"element vertex {count}", *(f"property uint {name}" for name in COMPRESSED_WORDS)]
     if degree:
         header += [f"element sh {count}"]
         header += [f"property uchar f_rest_{k}" for k in range(rest.shape[1])]
@@ -74,13 +74,13 @@ def _within(
     values: npt.NDArray[np.floating],
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Values [N, C] as shares 0..1 of the bounds of their chunks, and these bounds [chunks, C]."""
-    starts = np.arange(0, len(values), CHUNK)
+    starts = np.arange(0, len(values), COMPRESSED_CHUNK)
     numbers = np.asarray(values, np.float64)
     if not len(starts):
         empty = np.zeros((0, numbers.shape[1]))
         return numbers, empty, empty
     low, high = np.minimum.reduceat(numbers, starts), np.maximum.reduceat(numbers, starts)
-    chunk = np.arange(len(values)) // CHUNK
+    chunk = np.arange(len(values)) // COMPRESSED_CHUNK
     span = (high - low)[chunk]
     flat = span < 1e-5  # readers multiply by the span: nothing is lost
     return np.where(flat, 0, (numbers - low[chunk]) / np.where(flat, 1, span)), low, high
