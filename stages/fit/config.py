@@ -16,7 +16,7 @@ from stages.fit.parts.detail import Detail
 from stages.fit.parts.extension import MORE, Extension
 from stages.fit.parts.harmonics import Harmonics, Photometry
 from stages.fit.parts.light import Light
-from stages.fit.parts.objectives import Depth, Flow, Variation
+from stages.fit.parts.objectives import Depth, Flow, Silhouette, Variation
 from stages.fit.parts.progressive import Progressive
 from stages.fit.parts.start import Coarse, Filling, Saturation, Shading
 from stages.fit.parts.surface import Lining, Surface, Warp
@@ -37,13 +37,14 @@ from stages.fit.settings import (
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
     Progressive, Filling, Shading, Saturation, Coarse, Extension, Harmonics, Photometry, Detail,
-    Exposure, Background, Depth, Flow, Light, Isotropic, Variation, Warp, Mcmc, Surface, Lining,
-    Poses, Focal, Density, Floaters, Colours,
+    Exposure, Background, Depth, Flow, Silhouette, Light, Isotropic, Variation, Warp, Mcmc, Surface,
+    Lining, Poses, Focal, Density, Floaters, Colours,
 )  # fmt: skip
 PartName = Literal[
     "background", "coarse", "colours", "density", "depth", "detail", "exposure", "extension",
     "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "lining", "mcmc",
-    "photometry", "poses", "progressive", "saturation", "shading", "surface", "variation", "warp",
+    "photometry", "poses", "progressive", "saturation", "shading", "silhouette", "surface",
+    "variation", "warp",
 ]  # fmt: skip
 
 
@@ -103,7 +104,8 @@ class FitConfig(
     Density.Settings, Detail.Settings, Photometry.Settings, Harmonics.Settings, Warp.Settings,
     Surface.Settings, Lining.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings,
     Poses.Settings, Extension.Settings, Coarse.Settings, Variation.Settings, Depth.Settings,
-    Flow.Settings, Light.Settings, Saturation.Settings, Shading.Settings, Filling.Settings, Basics,
+    Flow.Settings, Silhouette.Settings, Light.Settings, Saturation.Settings, Shading.Settings,
+    Filling.Settings, Basics,
 ):  # fmt: skip
     """``auto`` follows the number of placed views; the summary tells what it came to.
 

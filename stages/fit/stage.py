@@ -19,7 +19,7 @@ class FitStage(Stage):
     """views + cameras + points (+ flow) -> gaussians + refined cameras."""
 
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 27
+    version: ClassVar[int] = 28
     summary: ClassVar[str] = "optimise Gaussians and camera poses against the photographs"
     Config: ClassVar[type[StageConfig]] = FitConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras", "points")

@@ -8,6 +8,7 @@ import functools
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from pipeline.artifacts.confidence import COMPLETED, FILLED
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
@@ -79,6 +80,25 @@ def test_gum_is_shown_only_up_to_its_height() -> None:
     # Zeniths lie 8 mm above the upper edges at y = 0.
     assert low.positions[:, 1].max() < 9.7
     assert 10.5 < high.positions[:, 1].max() < 12.2
+
+
+def test_gum_ends_in_the_photographs_where_the_cloud_ends() -> None:
+    """What they show beyond its even rim is nothing that a fit could explain."""
+    images, valid, dentitions, fit, truth = inputs()
+    notches = np.arange(images[0].shape[1]) % 100 < 30
+    usable = [
+        mask & ((kind != GUM) | ~notches) for mask, (_, _, kind) in zip(valid, truth, strict=True)
+    ]
+    notched = dense_surface(images, usable, dentitions, fit, SurfaceOptions(rounds=()), threads=2)
+    tree = cKDTree(notched.positions)
+    for view, placed, (_, _, kind) in zip(notched.views, fit.views, truth, strict=True):
+        rows, columns = np.nonzero((view.depth > 0) & (kind == GUM))
+        camera = placed.camera("", kind.shape[1], kind.shape[0])
+        z = view.depth[rows, columns].astype(np.float64)
+        x = (columns + 0.5 - camera.cx) / camera.fx * z
+        y = (rows + 0.5 - camera.cy) / camera.fy * z
+        world = (np.stack([x, y, z], 1) - camera.translation) @ camera.rotation
+        assert len(rows) > 1000 and (tree.query(world)[0] < 0.3).mean() > 0.99
 
 
 def test_no_glove_in_the_cloud() -> None:

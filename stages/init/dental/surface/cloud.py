@@ -45,7 +45,10 @@ _FACES = 0.15
 
 @dataclass(frozen=True)
 class Cloud:
-    """See `ArchSurface`; gains [V, 3] are those of the photographs used."""
+    """See `ArchSurface`; gains [V, 3] are those of the photographs used.
+
+    Per chart `reach` [H, W] float32 0..1 is the share of a sample's surroundings that is kept.
+    """
 
     positions: Array32
     colors: Array32
@@ -54,6 +57,7 @@ class Cloud:
     tooth: Mask
     faces: npt.NDArray[np.int32]
     gains: Array64
+    reach: list[Array32]
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def coloured_cloud(
         anchor,
     )
     parts: list[tuple[npt.NDArray[np.generic], ...]] = []
-    start = 0
+    start, reach = 0, []
     for layer in layers:
         colours = [showing.colour for showing in layer.showings]
         colour, total = blend(colours, layer.weights, gains, layer.grid.density)
@@ -116,6 +120,7 @@ def coloured_cloud(
         kept = coloured | hidden
         agreement = layer.chart.grid.resample(layer.chart.agreement, layer.grid)
         agreement = np.where(hidden, 0, agreement).astype(np.float32)
+        reach.append(layer.grid.resample(kept.astype(np.float32), layer.chart.grid))
         number = np.cumsum(kept.ravel()) - 1 + start
         start += int(kept.sum())
         parts.append(
@@ -137,6 +142,7 @@ def coloured_cloud(
         tooth=joined[4].astype(bool),
         faces=joined[5].astype(np.int32),
         gains=gains,
+        reach=reach,
     )
 
 

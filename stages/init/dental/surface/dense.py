@@ -141,12 +141,13 @@ def dense_surface(
             charts, looked.photos, looked.shown, looked.nearest, looked.clear,
             _anchor(photos, fit), options, threads,
         )  # fmt: skip
+        views = looked.views_of(len(images), cloud.reach, threads)
         progress("colour", steps, steps)
     gains = np.ones((len(images), 3))
     for photo, gain in zip(photos, cloud.gains, strict=True):
         gains[photo.index] = gain
     return ArchSurface(
-        views=looked.views_of(len(images)),
+        views=views,
         positions=cloud.positions,
         colors=cloud.colors,
         normals=cloud.normals,
@@ -222,7 +223,7 @@ def completed_surface(
         measured = [depths[photo.index] for photo in start.photos]
         bend_to(start.charts, start.photos, measured, start.options, threads)
         looked = _look_at(start.charts, start.photos, full, start.options, threads)
-        return looked.views_of(start.count)
+        return looked.views_of(start.count, [], threads)
 
 
 @dataclass(frozen=True)
@@ -234,19 +235,24 @@ class _Looked:
         shown: the same at the size that depths and colours are wanted in.
         nearest: per photograph the z-depth [h, w] of the nearest chart.
         clear: per chart where it is seen clearly, [H, W] bool; None: everywhere.
-        looks: the surface in each of `shown`.
+        charts: of the jaws.
+        options: settings.
     """
 
     photos: list[Photo]
     shown: list[Photo]
     nearest: list[Array32]
     clear: list[Mask | None]
-    looks: list[SurfaceView]
+    charts: list[Chart]
+    options: SurfaceOptions
 
-    def views_of(self, count: int) -> tuple[SurfaceView | None, ...]:
-        """One per photograph of so many, None where it was not placed."""
+    def views_of(
+        self, count: int, reach: list[Array32], threads: int
+    ) -> tuple[SurfaceView | None, ...]:
+        """One per photograph of so many, None where it was not placed; `_look` has `reach`."""
+        looks = in_threads(lambda photo: _look(photo, self, reach), self.shown, threads)
         views: list[SurfaceView | None] = [None] * count
-        for photo, look in zip(self.photos, self.looks, strict=True):
+        for photo, look in zip(self.photos, looks, strict=True):
             views[photo.index] = look
         return tuple(views)
 
@@ -275,8 +281,7 @@ def _look_at(
         clear[:] = in_threads(
             lambda chart: clearly_seen(chart, photos, nearest, options), charts, threads
         )
-    looks = in_threads(lambda photo: _look(photo, charts, clear, options), shown, threads)
-    return _Looked(photos, shown, nearest, clear, looks)
+    return _Looked(photos, shown, nearest, clear, charts, options)
 
 
 def _sweep(
@@ -352,12 +357,14 @@ def _prepare(
     )  # fmt: skip
 
 
-def _look(
-    photo: Photo, charts: list[Chart], clear: list[Mask | None], options: SurfaceOptions
-) -> SurfaceView:
+def _look(photo: Photo, looked: _Looked, reach: list[Array32]) -> SurfaceView:
     """The surface as a photograph sees it: tooth where it shows tooth, gum where it shows gum.
 
-    Per chart `clear` [H, W] bool says where it has depth; None: everywhere.
+    Args:
+        photo: at the size that depths are wanted in.
+        looked: the charts.
+        reach: per chart [H, W] float32 0..1, gum ends where it is half; empty: as far as it is
+            shown. What a fit is to explain must not go on where the cloud ends.
     """
     depth = np.zeros(photo.size, np.float32)
     normal = np.zeros((*photo.size, 3), np.float32)
@@ -368,11 +375,16 @@ def _look(
     }
     tissue = own["upper"] | own["lower"]
     certain = np.zeros(photo.size, bool)
-    for chart, seen in zip(charts, clear, strict=True):
-        z, place = raster_chart(photo, chart.points, chart.used(PAST_EDGE, options.gum_height))
+    tooth = (photo.upper > 0) | (photo.lower > 0)
+    for number, (chart, seen) in enumerate(zip(looked.charts, looked.clear, strict=True)):
+        z, place = raster_chart(
+            photo, chart.points, chart.used(PAST_EDGE, looked.options.gum_height)
+        )
         x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
         if seen is not None:
             z = z * (cv2.remap(seen.astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.5)
+        if reach:
+            z = z * (tooth | (cv2.remap(reach[number], x, y, cv2.INTER_LINEAR) > 0.5))
         mine = own[chart.shape.jaw]
         # The photograph itself says which jaw it shows; without a chart of that jaw, the other's.
         better = (z > 0) & tissue & ((depth == 0) | (z < depth)) & ~certain
@@ -385,9 +397,9 @@ def _look(
         depth = np.where(better, z, depth)
         normal = np.where(better[..., None], turned, normal)
         agreement = np.where(better, agreed, agreement)
-    tooth = (photo.upper > 0) | (photo.lower > 0)
     depth *= tooth | without_fringes(depth > 0, photo.density)
     depth *= joined_to(depth > 0, tooth)  # no crumbs of gum
-    confidence = np.where(depth > 0, confidence_of(agreement, options.guess), 1).astype(np.float32)
+    sure = confidence_of(agreement, looked.options.guess)
+    confidence = np.where(depth > 0, sure, 1).astype(np.float32)
     normal *= (depth > 0)[..., None]
     return SurfaceView(depth, normal.astype(np.float32), confidence)
