@@ -14,7 +14,13 @@ from tests.stages.fit_case import HEIGHT, WIDTH, case
 
 #: So far from the middle the points end, in units of the sheet.
 END = 22.0
-HELD = {"light": "none", "hold_surface": True, "lining": 0.0, "initial_points": 600, "detail": False}
+HELD = {
+    "light": "none",
+    "hold_surface": True,
+    "lining": 0.0,
+    "initial_points": 600,
+    "detail": False,
+}
 
 
 def trainer(masked: bool = True, **config):
@@ -36,9 +42,7 @@ def trainer(masked: bool = True, **config):
 
 def beyond(fit, outside) -> float:
     """How much is drawn where a fit with the part says that nothing was."""
-    found = [
-        (outside[view][1] * (1 - fit.render(view).transmittance)).sum() for view in fit.views
-    ]
+    found = [(outside[view][1] * (1 - fit.render(view).transmittance)).sum() for view in fit.views]
     return float(np.mean(found))
 
 
