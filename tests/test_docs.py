@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +77,36 @@ def test_targets_of_make_exist(page: Path) -> None:
         assert f"\n{target}:" in makefile
 
 
-def test_examples_of_extending_run(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "extending.md"
-    names: dict[str, Any] = {}
-    for block in blocks(page, "python"):
-        exec(compile(block, str(page), "exec"), names)
-    names["Heights"]({"11": 9.5}).save(tmp_path)
-    assert names["Heights"].load(tmp_path).by_tooth == {"11": 9.5}
+def test_the_package_that_extending_shows_installs_and_runs(tmp_path: Path) -> None:
+    """Each block goes into the file that its first line names, without one into the project's."""
+    texts: dict[str, str] = {}
+    for block in blocks(ROOT / "docs" / "extending.md", "python", "toml"):
+        named = re.match(r"# (\S+)\n", block)
+        name = named.group(1) if named else "pyproject.toml"
+        texts[name] = texts.get(name, "") + block
+    assert set(texts) == {
+        "thinning/stage.py", "thinning/heights.py", "pyproject.toml", "try_it.py",
+    }  # fmt: skip
+    source, there = tmp_path / "source", tmp_path / "there"
+    for name, text in texts.items():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_text(text)
+    install = ["-m", "pip", "install", "--no-deps", "--no-index", "--no-build-isolation", "--quiet"]
+    subprocess.run([sys.executable, *install, "--target", there, source], check=True)
+    check = """
+import runpy, sys
+from pathlib import Path
+runpy.run_path(sys.argv[1])
+from pipeline.artifacts import artifact_class
+from pipeline.stage import get_stage
+assert get_stage("thin").Config(keep=3).keep == 3
+Heights = artifact_class("heights")
+Heights({"11": 9.5}).save(Path(sys.argv[2]))
+assert Heights.load(Path(sys.argv[2])).by_tooth == {"11": 9.5}
+"""
+    path = os.pathsep.join([str(there), str(ROOT)])
+    call = [sys.executable, "-c", check, source / "try_it.py", tmp_path]
+    subprocess.run(call, check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
 
 
 def test_what_formats_says_of_teeth_yaml_is_read(tmp_path: Path) -> None:
