@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -344,16 +345,15 @@ def _best(source, target, motion):  # type: ignore[no-untyped-def]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="folder with scan_video_a, dental_photos_a")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="holds scan_video_a")
     parser.add_argument("--only", default="", help="one set, as 001,012,022 or 'photos'")
     parser.add_argument("--long-side", type=int, default=SIZE[0], help="of the photographs, pixels")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--pictures", type=Path, help="where to write the pictures")
     options = parser.parse_args()
-    if options.data is None:
-        print("benchmarks/dental.py: nothing to do without --data FOLDER")
-        return
+    if not (options.data / "scan_video_a" / "teeth.ply").is_file():
+        sys.exit(f"{options.data} has no scan_video_a/teeth.ply.")
     scan = Scan(options.data / "scan_video_a" / "teeth.ply")
     sets = [*TRIPLES, PHOTOS] if (options.data / "dental_photos_a").is_dir() else [*TRIPLES]
     if options.only:

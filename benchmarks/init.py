@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -240,7 +241,9 @@ def with_reference(case: Case, kept: dict[str, Placed], threads: int) -> Case:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="folder with scan_video_a, castle and berlin")
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder with scan_video_a, castle and berlin"
+    )
     parser.add_argument("--only", nargs="+", default=[""], help="sets whose name contains one")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--threads", type=int, default=2)
@@ -248,9 +251,6 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="of init")
     parser.add_argument("--out", type=Path, help="folder for the figures, added to by later runs")
     options = parser.parse_args()
-    if options.data is None:
-        print("benchmarks/init.py: nothing to do without --data FOLDER")
-        return
     settings: dict[str, Any] = {}
     for text in options.set:
         *parents, leaf = text.split("=", 1)[0].split(".")
@@ -265,7 +265,9 @@ def main() -> None:
     chosen = [
         case for case in cases(options.data) if any(part in case.name for part in options.only)
     ]
-    if "ours" in options.methods and chosen:
+    if not chosen:
+        sys.exit(f"{options.data} has none of the sets that were asked for.")
+    if "ours" in options.methods:
         run_ours(chosen[0], options.threads, settings, 256)  # compiles and imports
     for plain in chosen:
         case = with_reference(plain, reference, options.threads)

@@ -301,7 +301,7 @@ def settings_of(texts: Sequence[str]) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="folder with triads and series")
+    parser.add_argument("--data", type=Path, required=True, help="folder with triads and series")
     parser.add_argument("--out", type=Path, help="folder for figures, pictures and readings")
     parser.add_argument("--only", default="", help="cases, with commas between them")
     parser.add_argument("--mixes", type=int, default=0, metavar="N", help="so many mixes too")
@@ -313,9 +313,6 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="processes that run mixes")
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="of init")
     options = parser.parse_args()
-    if options.data is None:
-        print("benchmarks/triads.py: nothing to do without --data FOLDER")
-        return
     with tempfile.TemporaryDirectory() as scratch:
         run(options, options.out or Path(scratch))
 

@@ -65,7 +65,7 @@ When a run ends, open WORKSPACE/results/viewer.html in a browser. 'pipeline run 
 app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Photographs of teeth in, a 3D scene out; no GPU, no model weights, no network.",
+    help="Photographs of teeth in, a 3D scene out; no GPU, no downloads, no network.",
 )
 
 

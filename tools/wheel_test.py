@@ -7,6 +7,7 @@ The new environment borrows this one's libraries, so that nothing is downloaded.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -37,10 +38,12 @@ SHORT = ("fit.iterations=60", "export.video_seconds=1", "export.mesh_faces=5000"
 
 
 def main() -> None:
-    if len(sys.argv) > 1:
-        folder = Path(sys.argv[1]).resolve()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", help="a new one, which stays")
+    folder = parser.parse_args().folder
+    if folder is not None:
         folder.mkdir(parents=True)
-        check(folder)
+        check(folder.resolve())
     else:
         with tempfile.TemporaryDirectory(prefix="dentalsplat_wheel_") as made:
             check(Path(made))

@@ -118,7 +118,7 @@ def benchmark_command(
     """Compare methods on scenes and numbers of views, and write the paper's tables of them.
 
     For example: pipeline benchmark smoke -o runs/smoke; or, with the data of a suite elsewhere:
-    pipeline benchmark configs/suites/paper.yaml --data ../data --jobs 2. Finished cells are not run
+    pipeline benchmark configs/suites/paper.yaml --data DATA --jobs 2. Finished cells are not run
     again. Results: tables.md, tables.csv, results.json and report.html.
     """
     from pipeline.front.progress import LineReporter
