@@ -174,6 +174,9 @@ def test_pages_made_from_the_code_are_whole(monkeypatch: pytest.MonkeyPatch) -> 
     for stage in stage_names():
         assert f"\n## {stage}\n" in pages["stages.md"]
     assert "\n## gaussians\n" in pages["artifacts.md"]
+    for part in ("View", "PointmapPair", "Camera", "FlowPair", "Light", "Crown"):
+        assert f"\n`{part}`:\n" in pages["artifacts.md"], part
+    compile(docs_pages.READ, "artifacts.md", "exec")
 
 
 def test_code_cites_pages_that_exist() -> None:

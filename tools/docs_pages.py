@@ -6,8 +6,10 @@ are never out of date.
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ ROOT = str(Path(__file__).resolve().parents[1])
 sys.path.insert(0, ROOT)
 
 import pipeline  # noqa: E402
-from pipeline.artifacts import KINDS, artifact_class  # noqa: E402
+from pipeline.artifacts import KINDS, Artifact, artifact_class  # noqa: E402
 from pipeline.front import settings  # noqa: E402
 
 
@@ -80,27 +82,59 @@ def settings_page() -> str:
     return "\n".join(lines)
 
 
+#: How an artifact of a finished run is read.
+READ = """\
+from pathlib import Path
+
+import dentalsplat
+from pipeline.artifacts import artifact_class
+
+folders = {stage.name: stage.folder for stage in dentalsplat.status(workspace="runs/demo")}
+cloud = artifact_class("points").load(Path(folders["sap"]) / "points")
+print(cloud.positions.shape, cloud.colors.dtype)
+"""
+
+
 def artifacts_page() -> str:
-    """Every kind of artifact, with what its class says of itself."""
+    """Every kind of artifact, with what its class and the parts of it say of themselves."""
     lines = [
         "# Artifacts", "",
         "An artifact is what stages hand to each other: arrays in memory, files in a common format",
         "on disk. They lie in `WORKSPACE/<stage>/<key>/<kind>/`. This page is made from the code.",
-        "",
+        "", "To read one of a finished run:", "", "```python", f"{READ}```", "",
     ]  # fmt: skip
     made = {kind: [] for kind in KINDS}
     for stage in pipeline.stages():
         for kind in (*stage.get("provides", ()), *stage.get("may_provide", ())):
             made.setdefault(kind, []).append(stage["name"])
+    told: set[str] = set()  # modules; one may have two kinds
     for kind, stages in made.items():
         found = artifact_class(kind)
+        again = found.__module__ in told
+        told.add(found.__module__)
         by = ", ".join(f"[{name}](stages.md#{name})" for name in stages)
         module = inspect.getdoc(sys.modules[found.__module__]) or ""
-        about = _sentence(module.split(": ", 1)[-1].split("\n\n")[0].replace("\n", " "))
-        lines += [f"## {kind}", "", about, "", f"Made by: {by or 'no stage of ours'}.", ""]
+        about = _sentence(re.sub(r"^`\w+`: ", "", module).split("\n\n")[0].replace("\n", " "))
+        lines += [f"## {kind}", ""] + ([] if again else [about, ""])
+        lines += [f"Made by: {by or 'no stage of ours'}.", ""]
         lines += [f"In Python: `{found.__module__}.{found.__name__}`.", ""]
         lines += ["```text", inspect.getdoc(found) or "", "```", ""]
+        for part in [] if again else _parts(found):
+            lines += [f"`{part.__name__}`:", "", "```text", inspect.getdoc(part) or "", "```", ""]
     return "\n".join(lines)
+
+
+def _parts(found: type) -> list[type]:
+    """The classes that an artifact's arrays are in: those of its module that are no artifacts."""
+    return [
+        part
+        for name, part in vars(sys.modules[found.__module__]).items()
+        if dataclasses.is_dataclass(part)
+        and isinstance(part, type)
+        and part.__module__ == found.__module__
+        and not issubclass(part, Artifact)
+        and not name.startswith("_")
+    ]
 
 
 def _sentence(text: str) -> str:
