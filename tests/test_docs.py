@@ -109,6 +109,15 @@ assert Heights.load(Path(sys.argv[2])).by_tooth == {"11": 9.5}
     subprocess.run(call, check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
 
 
+def test_architecture_names_every_folder() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    folders = {path.parent.name for path in (ROOT / "pipeline").glob("*/__init__.py")}
+    assert [name for name in sorted(folders) if f"`pipeline/{name}/`" not in text] == []
+    beside = {path.parent.name for path in (ROOT / "stages").glob("*/__init__.py")}
+    beside -= set(stage_names())
+    assert [name for name in sorted(beside) if f"`stages/{name}/`" not in text] == []
+
+
 def test_what_formats_says_of_teeth_yaml_is_read(tmp_path: Path) -> None:
     (text,) = blocks(ROOT / "docs" / "formats.md", "yaml")
     path = tmp_path / "teeth.yaml"
