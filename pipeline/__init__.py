@@ -1,4 +1,4 @@
-"""dentalsplat: a few unposed photographs of teeth in, a 3D scene to look at out.
+"""dentalsplat: a 3D scene from a few unposed photographs of teeth.
 
     import pipeline
     summary = pipeline.run("photos/", overrides={"fit.iterations": 500})

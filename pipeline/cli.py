@@ -65,7 +65,7 @@ When a run ends, open WORKSPACE/results/viewer.html in a browser. 'pipeline run 
 app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Photographs of teeth in, a 3D scene out; no GPU, no downloads, no network.",
+    help="A 3D scene from photographs of teeth; no GPU, no downloads, no network.",
 )
 
 
