@@ -248,7 +248,7 @@ def doctor_command(as_json: AsJson = False) -> None:
 
 @app.command("warmup")
 def warmup_command() -> None:
-    """Compile the kernels of all stages ahead, as for an image; a first run does it by itself.
+    """Compile the kernels of the usual settings ahead, as for an image; a run does it by itself.
 
     They are kept beside the program where that can be written, so that all users have them.
     """

@@ -102,8 +102,8 @@ class Runner:
         def tell(kernel: str) -> None:
             if not told:
                 self.reporter.message(
-                    "Kernels are compiled for this processor, once: this run takes a minute or two "
-                    "longer than the next."
+                    "Kernels are compiled for this processor, once: that takes up to two minutes, "
+                    "which later runs save."
                 )
             told.add(kernel)
 
