@@ -1,6 +1,7 @@
 """Parts of the comparison with COLMAP: models, databases, runs, poses, clouds."""
 
 import sqlite3
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,6 +156,13 @@ def test_the_reason_for_no_model_names_the_best_pair(tmp_path):
     assert text == (
         "3.jpg sees 15 of the model's points by 20 verified matches (COLMAP asks for 30 points)"
     )
+
+
+def test_a_database_is_read_without_a_copy_in_the_temporary_folder(tmp_path, monkeypatch):
+    """It names photographs, and a killed comparison would leave it there."""
+    database(tmp_path / "d.db", [np.zeros((3, 2))] * 2, {})
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    assert evidence.read_evidence(tmp_path / "d.db").keypoints.keys() == {"1.jpg", "2.jpg"}
 
 
 def test_colmap_on_images_without_texture_says_why(tmp_path):

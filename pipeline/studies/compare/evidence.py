@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,25 +60,24 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             pass
     except UnusableFile as error:
         raise sqlite3.DatabaseError(f"it {error}") from error
-    with tempfile.TemporaryDirectory() as scratch:
-        source = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-        target = sqlite3.connect(Path(scratch) / "database.db")
-        try:
-            source.backup(target)
-            target.text_factory = lambda text: text.decode(errors="replace")
-            # A schema is a program too: views and expressions of others are not run for long.
-            target.execute("PRAGMA trusted_schema = OFF")
-            target.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
-            tables = {name for (name,) in target.execute(_TABLES)}
-            for name in ("images", "cameras", "keypoints", "two_view_geometries"):
-                if name not in tables:
-                    raise sqlite3.DatabaseError(f"it has no table {name}")
-            yield target
-        except UnicodeDecodeError as error:  # also of SQLite's own message about the schema
-            raise sqlite3.DatabaseError("it holds names that are no text") from error
-        finally:
-            source.close()
-            target.close()
+    source = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    target = sqlite3.connect("")  # a database without a name: nothing of it is left on the disk
+    try:
+        source.backup(target)
+        target.text_factory = lambda text: text.decode(errors="replace")
+        # A schema is a program too: views and expressions of others are not run for long.
+        target.execute("PRAGMA trusted_schema = OFF")
+        target.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+        tables = {name for (name,) in target.execute(_TABLES)}
+        for name in ("images", "cameras", "keypoints", "two_view_geometries"):
+            if name not in tables:
+                raise sqlite3.DatabaseError(f"it has no table {name}")
+        yield target
+    except UnicodeDecodeError as error:  # also of SQLite's own message about the schema
+        raise sqlite3.DatabaseError("it holds names that are no text") from error
+    finally:
+        source.close()
+        target.close()
 
 
 def read_evidence(path: Path) -> Evidence:
