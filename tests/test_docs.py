@@ -184,7 +184,8 @@ def test_pages_made_from_the_code_are_whole(monkeypatch: pytest.MonkeyPatch) -> 
         assert f"\n## {stage}\n" in pages["stages.md"]
     assert "\n## gaussians\n" in pages["artifacts.md"]
     for part in ("View", "PointmapPair", "Camera", "FlowPair", "Light", "Crown"):
-        assert f"\n`{part}`:\n" in pages["artifacts.md"], part
+        assert f"\n### {part}\n" in pages["artifacts.md"], part
+    assert "\n- `positions`: [N, 3] float32.\n" in pages["artifacts.md"]
     compile(docs_pages.READ, "artifacts.md", "exec")
 
 

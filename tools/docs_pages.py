@@ -89,8 +89,9 @@ from pathlib import Path
 import dentalsplat
 from pipeline.artifacts import artifact_class
 
-folders = {stage.name: stage.folder for stage in dentalsplat.status(workspace="runs/demo")}
-cloud = artifact_class("points").load(Path(folders["sap"]) / "points")
+stages = dentalsplat.status(workspace="runs/demo")
+folders = {stage.name: Path(stage.folder) for stage in stages}
+cloud = artifact_class("points").load(folders["sap"] / "points")
 print(cloud.positions.shape, cloud.colors.dtype)
 """
 
@@ -118,9 +119,9 @@ def artifacts_page() -> str:
         lines += [f"## {kind}", ""] + ([] if again else [about, ""])
         lines += [f"Made by: {by or 'no stage of ours'}.", ""]
         lines += [f"In Python: `{found.__module__}.{found.__name__}`.", ""]
-        lines += ["```text", inspect.getdoc(found) or "", "```", ""]
+        lines += _told(found)
         for part in [] if again else _parts(found):
-            lines += [f"`{part.__name__}`:", "", "```text", inspect.getdoc(part) or "", "```", ""]
+            lines += [f"### {part.__name__}", "", *_told(part)]
     return "\n".join(lines)
 
 
@@ -135,6 +136,17 @@ def _parts(found: type) -> list[type]:
         and not issubclass(part, Artifact)
         and not name.startswith("_")
     ]
+
+
+def _told(part: type) -> list[str]:
+    """What a class says of itself, its attributes as a list."""
+    about, _, attributes = (inspect.getdoc(part) or "").partition("\n\nAttributes:\n")
+    entries = re.split(r"\n    (?! )", attributes.removeprefix("    ")) if attributes else []
+    lines = [about, ""]
+    for entry in entries:
+        names, _, meaning = " ".join(entry.split()).partition(": ")
+        lines.append(f"- `{names}`: {meaning.replace('<', '&lt;')}")
+    return [*lines, ""]
 
 
 def _sentence(text: str) -> str:
