@@ -144,7 +144,7 @@ def test_processes_of_ours_pass_by_the_folder_they_start_in(tmp_path: Path) -> N
         [*module_command("pipeline.cli"), "--help"], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert "Photographs of teeth in" in done.stdout
+    assert "A 3D scene from photographs of teeth" in done.stdout
 
 
 def test_presets_are_ours_whatever_else_is_called_configs() -> None:
