@@ -117,5 +117,6 @@ endef
 	$(call install,.[dev])
 	touch .venv/installed $@
 
+# Not what else is in runs: people's cases are there.
 clean:
-	rm -rf .venv build dist runs *.egg-info
+	rm -rf .venv build dist *.egg-info runs/demo runs/site runs/gallery

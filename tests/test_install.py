@@ -147,6 +147,12 @@ def test_processes_of_ours_pass_by_the_folder_they_start_in(tmp_path: Path) -> N
     assert "A 3D scene from photographs of teeth" in done.stdout
 
 
+def test_make_clean_leaves_cases_where_runs_keep_them() -> None:
+    recipe = (ROOT / "Makefile").read_text().partition("\nclean:\n")[2].splitlines()[0]
+    deleted = [word.rstrip("/*") for word in recipe.split()]
+    assert "dist" in deleted and "runs" not in deleted
+
+
 def test_presets_are_ours_whatever_else_is_called_configs() -> None:
     assert (shipped_configs() / "dentalsplat.yaml").is_file()
     assert (shipped_configs() / "suites").is_dir()
