@@ -39,7 +39,8 @@ def folders() -> list[Path]:
     else:
         with contextlib.suppress(RuntimeError):  # a user without a home
             found.append(Path.home() / ".cache" / "dentalsplat" / "kernels")
-    found.append(Path(tempfile.gettempdir()) / f"dentalsplat-kernels-{os.getuid()}")
+    if hasattr(os, "getuid"):  # Windows has none, and a cache for each user
+        found.append(Path(tempfile.gettempdir()) / f"dentalsplat-kernels-{os.getuid()}")
     return found
 
 
@@ -74,6 +75,8 @@ def for_all(path: Path) -> None:
 
 def _ours(folder: Path) -> bool:
     """Compiled code is run: nobody else may have put it there."""
+    if not hasattr(os, "getuid"):
+        return folder.is_dir()
     try:
         found = folder.lstat()
     except OSError:

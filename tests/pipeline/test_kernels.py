@@ -251,6 +251,15 @@ class TestPlace:
         monkeypatch.setattr(folder, "folders", lambda: [nowhere, *others])
         assert folder.writable() == tmp_path / f"dentalsplat-kernels-{os.getuid()}"
 
+    def test_a_system_without_user_ids(self, nowhere, tmp_path, monkeypatch):
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        monkeypatch.delattr(os, "getuid")
+        cache_of_user = folder.folders()[-1]
+        assert cache_of_user == tmp_path / "dentalsplat" / "kernels"
+        monkeypatch.setattr(folder, "folders", lambda: [nowhere, cache_of_user])
+        assert folder.writable() == cache_of_user
+
     def test_what_others_can_write_is_not_read(self, tmp_path, nowhere, monkeypatch):
         shared = tmp_path / "shared"
         shared.mkdir()
