@@ -98,7 +98,7 @@ def run_command(
     frames: Annotated[
         int | None,
         typer.Option(
-            "--frames", metavar="N", help="Use so many, evenly chosen; default: all, 24 of a video."
+            "--frames", metavar="N", help="Use so many, spread out; default: all, 24 of a video."
         ),
     ] = None,
     from_stage: Annotated[

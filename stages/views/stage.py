@@ -28,7 +28,7 @@ class ViewsConfig(StageConfig):
     )
     frames: int | None = Field(
         None, ge=2, le=1000,
-        description="use this many, evenly sampled; default: all photographs, 24 of a video",
+        description="use this many, spread over all; default: all photographs, 24 of a video",
     )  # fmt: skip
     sampling: Literal["difference", "time"] = Field(
         "difference",
