@@ -93,18 +93,12 @@ class DenseConfig(StageConfig):
     mask_highlights: bool = Field(
         DENSE.mask_highlights, description="keep highlights out of the matching"
     )
-    polish: int = Field(
-        DENSE.polish, ge=0, le=20, description="passes of PatchMatch after the sweep; 0: none"
-    )
-    polish_window: int = Field(
-        DENSE.polish_window, ge=3, le=31, description="side of its window, px, odd"
-    )
     fill: bool = Field(DENSE.fill, description="complete the depth where stereo knows nothing")
     fill_reach_px: float = Field(
         DENSE.fill_reach_px, gt=0, le=4096, description="reach of known depth into holes"
     )
 
-    @field_validator("window", "polish_window")
+    @field_validator("window")
     @classmethod
     def _odd(cls, value: int) -> int:
         if value % 2 == 0:

@@ -35,8 +35,6 @@ class DenseOptions:
         min_variance: grey variance below which a window counts as textureless.
         speckle: islands of fewer pixels are dropped.
         mask_highlights: keep highlights and saturated pixels out of the matching.
-        polish: passes of PatchMatch with slanted windows after the sweep; 0: none.
-        polish_window: side of its window in pixels, odd.
         fill: complete the depth where stereo knows nothing.
         fill_reach_px: how far known depth reaches into a hole.
     """
@@ -62,8 +60,6 @@ class DenseOptions:
     min_variance: float = 2e-5
     speckle: int = 30
     mask_highlights: bool = True
-    polish: int = 0
-    polish_window: int = 7
     fill: bool = True
     fill_reach_px: float = 80.0
 
