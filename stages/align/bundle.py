@@ -27,6 +27,24 @@ Feature = tuple[int, int]
 _REFERENCE_SIDE = 512.0
 #: Candidates nearer to each other than this are one feature, for the ratio test; pixels.
 _SAME_FEATURE = 3.0
+#: Matched points that are used at most (no `min_matches` can ask for more); those in most views
+#: come first.
+_MOST_TRACKS = 3000
+#: SIFT's contrast threshold.
+_CONTRAST = 0.01
+#: How far from where the pointmaps say a match may lie, and the ratio test against the next
+#: candidate in that area.
+_SEARCH, _RATIO = 20.0, 0.85
+#: Pairs of views whose axes differ by more are not matched, degrees.
+_MAX_ANGLE = 45.0
+#: Larger reprojection errors are dropped after the first round.
+_MAX_ERROR = 3.0
+#: Scale of Cauchy's loss, pixels of the image.
+_LOSS = 1.0
+#: Nothing is changed unless the median reprojection error falls by this factor. Noise of the
+#: pointmaps alone leaves matches a factor 1.2 to 1.8; where they are bent by 2 % it is 2.2 to 4.5,
+#: and matches are worth more than they.
+_MIN_GAIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -35,32 +53,14 @@ class BundleOptions:
 
     Attributes:
         features: per view at most.
-        contrast: SIFT's contrast threshold.
-        search_px: how far from where the pointmaps say a match may lie, pixels at 512.
-        ratio: ratio test against the next candidate in the search area.
-        max_tracks: matched points that are used; those in most views come first.
-        max_angle: pairs of views whose axes differ by more are not matched, degrees.
-        max_error_px: larger reprojection errors are dropped after the first round, pixels at 512.
-        loss_px: scale of Cauchy's loss, pixels.
         min_matches: with fewer matched features in any view nothing is changed.
-        min_gain: nothing is changed unless the median reprojection error falls by this factor.
-            Noise of the pointmaps alone leaves matches a factor 1.2 to 1.8; where they are bent
-            by 2 % it is 2.2 to 4.5, and matches are worth more than they.
         free_focals: matches tell focal lengths worse than pointmaps do where views are few.
         shared_focal: views of one size and principal point have one lens; where focal lengths
             stay, of one focal length too.
     """
 
     features: int = 3000
-    contrast: float = 0.01
-    search_px: float = 20.0
-    ratio: float = 0.85
-    max_tracks: int = 3000
-    max_angle: float = 45.0
-    max_error_px: float = 3.0
-    loss_px: float = 1.0
     min_matches: int = 80
-    min_gain: float = 2.0
     free_focals: bool = False
     shared_focal: bool = False
 
@@ -118,12 +118,12 @@ def refine_with_matches(
     for i, j in combinations(range(len(names)), 2):
         first, second = cameras[names[i]], cameras[names[j]]
         cosine = float(first.rotation[2] @ second.rotation[2])
-        if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > options.max_angle:
+        if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > _MAX_ANGLE:
             continue
-        forth = _guided(found[i], found[j], second, options, unit)
-        back = _guided(found[j], found[i], first, options, unit)
+        forth = _guided(found[i], found[j], second, unit)
+        back = _guided(found[j], found[i], first, unit)
         matches += [((i, a), (j, b)) for a, b in sorted(forth.items()) if back.get(b) == a]
-    tracks = sorted(_tracks(matches), key=lambda track: -len(track))[: options.max_tracks]
+    tracks = sorted(_tracks(matches), key=lambda track: -len(track))[:_MOST_TRACKS]
     kept = dict(cameras)
     seen = [sum(any(view == v for view, _ in track) for track in tracks) for v in range(len(names))]
     unknown = float("nan")
@@ -135,7 +135,7 @@ def refine_with_matches(
     model = _model(placed, found, tracks, options)
     before = float(np.median(_errors(model)))
     _adjust(model, options)
-    _drop(model, options.max_error_px * unit)
+    _drop(model, _MAX_ERROR * unit)
     left = [sum(p.has_point3D() for p in model.images[k].points2D) for k in model.images]
     if min(left) < options.min_matches:
         return Bundle(kept, len(tracks), before, unknown, "they contradict each other")
@@ -144,7 +144,7 @@ def refine_with_matches(
     motion = similarity_between(refined, [cameras[name] for name in names])
     kept |= {camera.name: move_camera(camera, motion) for camera in refined}
     after = float(np.median(_errors(model)))
-    if before < options.min_gain * after:
+    if before < _MIN_GAIN * after:
         return Bundle(dict(cameras), len(tracks), before, after, "they agree with the pointmaps")
     return Bundle(kept, int(model.num_points3D()), before, after)
 
@@ -156,7 +156,7 @@ def _features(
     depth: ViewDepth,
     options: BundleOptions,
 ) -> _Features:
-    sift = cv2.SIFT.create(nfeatures=options.features, contrastThreshold=options.contrast)
+    sift = cv2.SIFT.create(nfeatures=options.features, contrastThreshold=_CONTRAST)
     keypoints, descriptors = sift.detectAndCompute(gray, usable.astype(np.uint8))
     if not keypoints:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
@@ -173,16 +173,14 @@ def _features(
     )
 
 
-def _guided(
-    source: _Features, target: _Features, camera: Camera, options: BundleOptions, unit: float
-) -> dict[int, int]:
+def _guided(source: _Features, target: _Features, camera: Camera, unit: float) -> dict[int, int]:
     """Best feature of the target's near where each of the source's is expected."""
     known = np.flatnonzero(np.isfinite(source.world[:, 2]))
     if len(known) == 0 or len(target.positions) == 0:
         return {}
     expected, depth = camera.project(source.world[known])
     tree = cKDTree(target.positions)
-    near = tree.query_ball_point(expected, options.search_px * unit, return_sorted=True)
+    near = tree.query_ball_point(expected, _SEARCH * unit, return_sorted=True)
     found = {}
     for feature, z, candidates in zip(known, depth, near, strict=True):
         if z <= 0 or not candidates:
@@ -194,7 +192,7 @@ def _guided(
         others = np.linalg.norm(place - place[best], axis=1) > _SAME_FEATURE * unit
         # Alone in its area, a candidate has only its own distance to speak for it.
         rival = float(distance[others].min()) if others.any() else 0.7
-        if distance[best] < options.ratio * rival:
+        if distance[best] < _RATIO * rival:
             found[int(feature)] = int(candidates[best])
     return found
 
@@ -284,7 +282,7 @@ def _adjust(model: Any, options: BundleOptions) -> None:
     settings.print_summary = False
     settings.ceres.use_gpu = False
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    settings.ceres.loss_function_scale = options.loss_px
+    settings.ceres.loss_function_scale = _LOSS
     settings.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.images):

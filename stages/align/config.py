@@ -32,25 +32,8 @@ class AlignConfig(StageConfig):
     iterations: int = Field(
         30, ge=0, le=10_000, description="Steps of the global alignment at most."
     )
-    tolerance: float = Field(
-        1e-5,
-        ge=0,
-        lt=1,
-        description="A step that lowers the objective by a smaller share is the last.",
-    )
     samples: int = Field(
         3000, ge=100, le=10_000_000, description="Pixels per view in the global alignment."
-    )
-    huber: float = Field(
-        1.0,
-        ge=0,
-        le=100,
-        description="Residual from which the loss is linear, in median residuals; 0: everywhere.",
-    )
-    free_pairs: bool = Field(
-        False,
-        description="A pair's frame may differ from the camera of its first view, as in DUSt3R; "
-        "for models whose maps don't fit a pinhole camera. Less accurate.",
     )
     matches: Literal["auto", "always", "never"] = Field(
         "auto",
@@ -60,44 +43,17 @@ class AlignConfig(StageConfig):
     match_features: int = Field(
         3000, ge=100, le=100_000, description="Features per view for that, at most."
     )
-    match_points: int = Field(3000, ge=10, description="Matched points that are used, at most.")
-    match_search_px: float = Field(
-        20.0,
-        gt=0,
-        le=1000,
-        description="How far from where the pointmaps say a match may lie, px at 512 px width.",
-    )
-    match_ratio: float = Field(
-        0.85, gt=0, le=1, description="Ratio test: best over next match in that area."
-    )
-    match_max_angle: float = Field(
-        45.0, gt=0, le=180, description="Views turned further apart are not matched, degrees."
-    )
-    match_max_error: float = Field(
-        3.0, gt=0, le=100, description="Beyond it a match is dropped, px at 512 px width."
-    )
     match_min: int = Field(
         80,
         ge=8,
-        description="With fewer matches in any view, the cameras stay as they are; match_points "
-        "at most.",
-    )
-    match_min_gain: float = Field(
-        2.0,
-        ge=1,
-        description="The cameras stay as they are unless the matches' error falls by this factor.",
-    )
-    match_focals_from: int = Field(
-        6, ge=2, description="From so many views on, the matches also correct focal lengths."
+        le=3000,
+        description="With fewer matches in any view, the cameras stay as they are.",
     )
     fill_confidence: Annotated[float, Field(ge=1)] | Literal["auto"] = Field(
         "auto",
         description="Depths of no more confidence count as fill: used where nothing better is. "
         "auto: 1.25; 1, which is none, of up to 5 photographs of a mouth near each other.",
     )  # fmt: skip
-    fill_stride: int = Field(
-        3, ge=1, le=64, description="Of the fill, one pixel in so many (in x and y) is taken."
-    )
     relative_depth: float = Field(
         0.01, gt=0, le=0.5,
         description="Relative depth difference within which two views see the same surface.",
@@ -119,11 +75,6 @@ class AlignConfig(StageConfig):
 
     @model_validator(mode="after")
     def _check(self) -> AlignConfig:
-        if self.match_points < self.match_min:
-            raise ValueError(
-                f"match_points ({self.match_points}) must not be less than match_min "
-                f"({self.match_min}): every view has to have so many of them"
-            )
         if self.matches == "always" and self.hold_poses:
             raise ValueError("matches=always moves poses, and hold_poses holds them")
         return self

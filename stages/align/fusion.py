@@ -19,6 +19,8 @@ Array = npt.NDArray[np.float32]
 
 #: Sum of the three channels by which views may differ in the colour of the same surface.
 _ALIKE = np.float32(0.3)
+#: Of the fill, one pixel in so many (in x and y) is considered.
+_FILL_STRIDE = 3
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,6 @@ class FusionOptions:
 
     Attributes:
         fill_confidence: depths of no more confidence are fill: used where nothing better is.
-        fill_stride: every so many pixels in x and y, one fill pixel is considered.
         relative_depth: relative difference of depth within which two views see the same surface.
         front: a depth this share in front of what another view sees there is refuted.
         min_agreeing: other views that must agree, all where there are fewer; 0: nothing but not
@@ -36,7 +37,6 @@ class FusionOptions:
     """
 
     fill_confidence: float = FILLED
-    fill_stride: int = 3
     relative_depth: float = 0.01
     front: float = 0.02
     min_agreeing: int = 0
@@ -230,8 +230,7 @@ def fuse(
                 keep, depth, color, residual,
             )  # fmt: skip
             thinned = np.zeros(shape, bool)
-            thinned[options.fill_stride // 2 :: options.fill_stride,
-                    options.fill_stride // 2 :: options.fill_stride] = True  # fmt: skip
+            thinned[_FILL_STRIDE // 2 :: _FILL_STRIDE, _FILL_STRIDE // 2 :: _FILL_STRIDE] = True
             kept = (keep == 1) | ((keep == 2) & thinned)
             fill += int(((keep == 2) & thinned).sum())
             residuals.append(residual[(keep == 1) & (residual >= 0)])

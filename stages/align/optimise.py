@@ -44,6 +44,8 @@ Array = npt.NDArray[np.float64]
 _DAMPING, _LESS, _MORE, _MOST = 1e-3, 0.2, 8.0, 1e6
 #: Seven directions (the world's own similarity) change nothing; this keeps them still.
 _LEAST_DAMPING = 1e-9
+#: A step that lowers the objective by a smaller share is the last one.
+_TOLERANCE = 1e-5
 #: Depths change by at most this factor (log) per step.
 _LARGEST_DEPTH_STEP = 0.5
 
@@ -93,9 +95,7 @@ def optimise(
             return start, _linearise(views, state, 1.0).mean
         if options.shared_focal and options.free_focals:
             state.focals[:] = common_focal(start, names)
-        if not options.free_pairs:
-            state = state.tied()
-        state, mean = _minimise(views, state, options, progress)
+        state, mean = _minimise(views, state.tied(), options, progress)
     return as_start(start, used, names, state), mean
 
 
@@ -137,7 +137,7 @@ def _minimise(
 ) -> tuple[State, float]:
     # A residual below this is rounding, and a weight that divides by it would be noise.
     least = 1e-9
-    delta = max(options.huber * _linearise(views, state, 1.0).median, least)
+    delta = max(_linearise(views, state, 1.0).median, least)
     system = _linearise(views, state, delta)
     damping = _DAMPING
     for step in range(options.iterations):
@@ -153,10 +153,10 @@ def _minimise(
         assert moved is not None
         gain = system.loss - trial.loss
         state, damping = moved, max(damping * _LESS, _LEAST_DAMPING)
-        settled = gain <= options.tolerance * system.loss
+        settled = gain <= _TOLERANCE * system.loss
         system = trial
         # Where residuals have shrunk, so does what counts as large; the loss is another one then.
-        smaller = max(options.huber * system.median, least)
+        smaller = max(system.median, least)
         if smaller < 0.9 * delta:
             delta = smaller
             system = _linearise(views, state, delta)
@@ -216,4 +216,4 @@ def _step(
         )
     ]  # fmt: skip
     moved = moved_by(state, solution, log_depths)
-    return moved if options.free_pairs else moved.tied()
+    return moved.tied()

@@ -26,22 +26,15 @@ class AlignOptions:
     Attributes:
         iterations: Levenberg-Marquardt steps at most.
         samples: about so many pixels per view, on an even grid.
-        tolerance: a step that lowers the objective by a smaller share is the last one.
-        huber: residual from which the loss is linear, in median residuals; 0: everywhere, as in
-            DUSt3R.
         free_focals, free_poses: what may move besides depths and similarities.
         shared_focal: where focal lengths may move, all views have one, relative to their long side.
-        free_pairs: a pair's frame may differ from the camera of its first view, as in DUSt3R.
     """
 
     iterations: int = 30
     samples: int = 3000
-    tolerance: float = 1e-5
-    huber: float = 1.0
     free_focals: bool = True
     free_poses: bool = True
     shared_focal: bool = False
-    free_pairs: bool = False
 
 
 @dataclass
@@ -189,10 +182,6 @@ def free_directions(state: State, options: AlignOptions) -> sparse.csr_array:
         entries.append((k, column[k], 1.0))
     for e, first in enumerate(state.first):
         row, own = CAMERA * count + PAIR * e, CAMERA * int(first)
-        if options.free_pairs:
-            entries += [(row + k, free + k, 1.0) for k in range(PAIR)]
-            free += PAIR
-            continue
         # Y = a (R X + t): the camera's rotation and translation, and log a.
         for k in range(3):
             if own + k in column:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 #: So few photographs of a mouth, no further apart than this (degrees): what is completed counts
 #: like what is measured.
 FEW_VIEWS, NEAR = 5, 30.0
+#: From so many views on, matches also correct focal lengths.
+MATCHED_FOCALS = 6
 
 
 class AlignStage(Stage):
@@ -106,8 +108,7 @@ class AlignStage(Stage):
             [start.cameras[name] for name in names],
             FusionOptions(
                 _fill_confidence(config, given, [start.cameras[name] for name in names]),
-                config.fill_stride, config.relative_depth, config.front,
-                config.min_agreeing, config.merge,
+                config.relative_depth, config.front, config.min_agreeing, config.merge,
             ),
             context.threads,
             lambda done, total: context.progress("fuse", done, total),
@@ -190,12 +191,9 @@ def _optimised(context, views, pairs, start):  # type: ignore[no-untyped-def]
     options = AlignOptions(
         iterations=config.iterations,
         samples=config.samples,
-        tolerance=config.tolerance,
-        huber=config.huber,
         free_focals=not hold_focals,
         free_poses=not config.hold_poses,
         shared_focal=shared,
-        free_pairs=config.free_pairs,
     )
     better, residual = optimise(
         pairs, start, options,
@@ -238,14 +236,8 @@ def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-
         depths,
         BundleOptions(
             features=config.match_features,
-            search_px=config.match_search_px,
-            max_tracks=config.match_points,
-            ratio=config.match_ratio,
-            max_angle=config.match_max_angle,
-            max_error_px=config.match_max_error,
             min_matches=config.match_min,
-            min_gain=config.match_min_gain,
-            free_focals=not hold_focals and len(start.cameras) >= config.match_focals_from,
+            free_focals=not hold_focals and len(start.cameras) >= MATCHED_FOCALS,
             shared_focal=shared,
         ),
     )
@@ -255,14 +247,13 @@ def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-
         if config.matches == "always":
             context.warn(
                 f"The {bundle.tracks:,} matched points change no camera: {bundle.reason} "
-                "(align.matches=always, align.match_min, align.match_min_gain)."
+                "(align.matches=always, align.match_min)."
             )
         return start
     figures["reprojection_error_px"] = round(bundle.after, 3)
     options = AlignOptions(
-        iterations=config.iterations, samples=config.samples, tolerance=config.tolerance,
-        huber=config.huber, free_focals=False, free_poses=False,
-    )  # fmt: skip
+        iterations=config.iterations, samples=config.samples, free_focals=False, free_poses=False
+    )
     return optimise(pairs, start_from_cameras(pairs, bundle.cameras), options)[0]
 
 

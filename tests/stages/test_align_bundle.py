@@ -162,7 +162,7 @@ def test_matches_that_are_asked_for_are_used_for_given_cameras_too(world, tmp_pa
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"match_points": 40}, "less than match_min"),
+    [({"match_min": 3001}, "less than or equal to 3000"),
      ({"matches": "always", "hold_poses": True}, "hold_poses holds them")],
 )  # fmt: skip
 def test_matches_that_could_change_nothing_are_refused(settings, said):
