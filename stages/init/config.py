@@ -43,28 +43,11 @@ class DenseConfig(StageConfig):
     max_planes: int = Field(
         DENSE.max_planes, ge=8, le=1024, description="largest number of depths tried"
     )
-    step_px: float = Field(
-        DENSE.step_px, gt=0, le=8, description="shift of a match from depth to depth, px"
-    )
     window: int = Field(
         DENSE.window, ge=3, le=31, description="side of the matching window, px, odd"
     )
-    p1: float = Field(DENSE.p1, ge=0, le=10, description="penalty for a depth change by one step")
-    p2: float = Field(DENSE.p2, ge=0, le=100, description="penalty for a larger depth change")
     sources: int = Field(
         DENSE.sources, ge=1, le=32, description="views that each view is compared with"
-    )
-    best_angle: float = Field(
-        DENSE.best_angle, gt=0, le=90, description="triangulation angle wanted, degrees"
-    )
-    min_angle: float = Field(
-        DENSE.min_angle, ge=0, le=90, description="least angle to a source view, degrees"
-    )
-    max_angle: float = Field(
-        DENSE.max_angle, gt=0, le=120, description="largest angle to a source, degrees"
-    )
-    range_margin: float = Field(
-        DENSE.range_margin, ge=0, le=5, description="share added to the depth range"
     )
     min_ncc: float = Field(
         DENSE.min_ncc, ge=-1, le=1, description="least correlation of a kept depth"
@@ -72,31 +55,13 @@ class DenseConfig(StageConfig):
     relative_depth: float = Field(
         DENSE.relative_depth, gt=0, le=0.5, description="depth agreement, relative"
     )
-    reprojection_px: float = Field(
-        DENSE.reprojection_px, gt=0, le=20, description="agreement in the image, px"
-    )
     min_agreeing: int = Field(
         DENSE.min_agreeing, ge=0, le=32, description="views that must agree; 0: automatic"
-    )
-    front: float = Field(
-        DENSE.front, gt=0, le=1, description="depths this far in front are refuted"
-    )
-    min_variance: float = Field(
-        DENSE.min_variance, ge=0, le=1, description="grey variance below which nothing is matched"
     )
     max_volume: int = Field(
         DENSE.max_volume, ge=1_000_000, description="pixels times depths that are in memory at once"
     )
-    speckle: int = Field(
-        DENSE.speckle, ge=0, le=100_000, description="smaller islands are dropped, pixels"
-    )
-    mask_highlights: bool = Field(
-        DENSE.mask_highlights, description="keep highlights out of the matching"
-    )
     fill: bool = Field(DENSE.fill, description="complete the depth where stereo knows nothing")
-    fill_reach_px: float = Field(
-        DENSE.fill_reach_px, gt=0, le=4096, description="reach of known depth into holes"
-    )
 
     @field_validator("window")
     @classmethod

@@ -15,6 +15,11 @@ from pipeline.kernels import kernel
 
 Array = npt.NDArray[np.float32]
 
+#: Grey difference that counts as an edge.
+_EDGE = np.float32(0.04)
+#: Gauss-Seidel sweeps per level.
+_SWEEPS = 24
+
 
 @kernel(parallel=True)
 def _relax(value, data, weight, right, down, pull, far, sweeps):  # type: ignore[no-untyped-def]
@@ -54,13 +59,11 @@ def complete(
     gray: Array,
     far: float,
     reach_px: float = 80.0,
-    edge: float = 0.04,
-    sweeps: int = 24,
 ) -> Array:
     """Complete an inverse depth map.
 
     Minimises sum w (v - d)^2 + sum g (v_p - v_q)^2 + (v - far)^2 / reach^2 over neighbouring
-    pixels p, q with g = exp(-|I_p - I_q| / edge) + 0.002, from coarse to fine.
+    pixels p, q with g = exp(-|I_p - I_q| / `_EDGE`) + 0.002, from coarse to fine.
 
     Args:
         inverse_depth: [H, W] float32.
@@ -68,8 +71,6 @@ def complete(
         gray: [H, W] float32 in 0..1, whose edges stop the smoothing.
         far: inverse depth that everything is drawn to.
         reach_px: how far known depth reaches into a hole without edges, in pixels.
-        edge: grey difference that counts as an edge.
-        sweeps: Gauss-Seidel sweeps per level.
 
     Returns:
         [H, W] float32 inverse depth everywhere.
@@ -87,10 +88,10 @@ def complete(
             value = value.repeat(2, 0).repeat(2, 1)[: data.shape[0], : data.shape[1]]
         value = np.ascontiguousarray(value, np.float32)
         right, down = np.zeros_like(data), np.zeros_like(data)
-        right[:, :-1] = np.exp(-np.abs(np.diff(image, axis=1)) / np.float32(edge)) + 0.002
-        down[:-1] = np.exp(-np.abs(np.diff(image, axis=0)) / np.float32(edge)) + 0.002
+        right[:, :-1] = np.exp(-np.abs(np.diff(image, axis=1)) / _EDGE) + 0.002
+        down[:-1] = np.exp(-np.abs(np.diff(image, axis=0)) / _EDGE) + 0.002
         pull = np.float32((2.0**level / reach_px) ** 2)
-        _relax(value, data, trust, right, down, pull, np.float32(far), int(sweeps))
+        _relax(value, data, trust, right, down, pull, np.float32(far), _SWEEPS)
     return value
 
 

@@ -32,6 +32,9 @@ Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
+#: Views agree within so many pixels of the image; a depth by this share in front of what another
+#: view sees there is refuted.
+_REPROJECTION, _FRONT = 1.5, 0.02
 #: The completed depth is tried at these shares of the way (in inverse depth) to the far plane.
 _RETREATS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -114,10 +117,7 @@ def _dense_depths(
     count = len(images)
     grays = [to_gray(image) for image in images]
     shiny = [highlights(image) > 0 for image in images]
-    usable = [
-        mask & ~bright if options.mask_highlights else mask
-        for mask, bright in zip(valid, shiny, strict=True)
-    ]
+    usable = [mask & ~bright for mask, bright in zip(valid, shiny, strict=True)]
     pyramids = [
         [Level(camera, gray, use)] for camera, gray, use in zip(cameras, grays, usable, strict=True)
     ]
@@ -131,10 +131,7 @@ def _dense_depths(
     buffers = Buffer(), Buffer()
     depths, scores = [], []
     for index in range(count):
-        chosen = select_sources(
-            index, cameras, points[index], options.sources,
-            options.best_angle, options.min_angle, options.max_angle,
-        )  # fmt: skip
+        chosen = select_sources(index, cameras, points[index], options.sources)
         find = _sweep_view if options.method == "sweep" else _sgbm_view
         depth, ncc = find(
             index, chosen, pyramids, points[index], everything, buffers, options
@@ -172,10 +169,10 @@ def _sweep_view(
         empty = np.zeros((camera.height, camera.width), np.float32)
         return empty, empty
     lenses = [pyramids[k][0].camera for k in chosen]
-    ends = inverse_depth_range(camera, points, everything, options.range_margin)
+    ends = inverse_depth_range(camera, points, everything)
     most = min(options.max_planes, max(options.max_volume // (camera.height * camera.width), 16))
     least = min(options.planes, most)
-    planes = plane_count(camera, lenses, ends, options.step_px, least, most)
+    planes = plane_count(camera, lenses, ends, least, most)
     levels = level_count(max(camera.width, camera.height), planes)
     ranges = None
     for level in range(levels, -1, -1):
@@ -186,8 +183,7 @@ def _sweep_view(
             own.camera, [o.camera for o in others], np.linspace(ends[0], ends[1], number)
         )
         volume = cost_volume(
-            own.gray, own.usable, stack, sizes, homographies, options.window,
-            options.min_variance, ranges, buffers[0],
+            own.gray, own.usable, stack, sizes, homographies, options.window, ranges, buffers[0],
         )  # fmt: skip
         penalty = edge_aware_penalty(own.gray, options.p2)
         total = aggregate(volume, penalty, options.p1, buffers[1])
@@ -214,7 +210,7 @@ def _sgbm_view(
     """As `_sweep_view`, from rectified pairs: the median of what the sources say."""
     own = pyramids[index][0]
     camera = own.camera
-    ends = inverse_depth_range(camera, points, everything, options.range_margin)
+    ends = inverse_depth_range(camera, points, everything)
     found = [
         sgbm_depth(
             own.gray, own.usable, camera, other.gray, other.usable, other.camera,
@@ -250,7 +246,7 @@ def _consistent(
     for index, depth in enumerate(depths):
         agree, conflict, fused, angle = check(
             index, stack, weights, table, depth.shape,
-            options.relative_depth, options.reprojection_px, options.front, others[index],
+            options.relative_depth, _REPROJECTION, _FRONT, others[index],
         )  # fmt: skip
         good = (agree >= needed) & (agree >= conflict)
         good &= large_islands(fused, good, options.speckle, 2 * options.relative_depth)
@@ -358,7 +354,7 @@ def _fill(
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
     far = 0.85 * float(np.percentile(inverse[known], 1))
     weight = np.where(known, np.minimum(confidence - 1, 5), 0).astype(np.float32)
-    smooth = complete(inverse, weight, gray, far, options.fill_reach_px)
+    smooth = complete(inverse, weight, gray, far)
     result = depth.copy()
     open_pixels = ~known
     weights = np.ones_like(stack)  # a view of one number would be a kernel of its own
@@ -368,7 +364,7 @@ def _fill(
         stack[index, :height, :width] = np.where(open_pixels, trial, 0)
         _, conflict, _, _ = check(
             index, stack, weights, table, (height, width),
-            options.relative_depth, options.reprojection_px, options.front, others,
+            options.relative_depth, _REPROJECTION, _FRONT, others,
         )  # fmt: skip
         accept = open_pixels & (conflict == 0)
         result[accept] = trial[accept]

@@ -9,6 +9,13 @@ from pipeline.artifacts.cameras import Camera
 
 Array = npt.NDArray[np.float64]
 
+#: Triangulation angles wanted and allowed, degrees.
+_BEST_ANGLE, _MIN_ANGLE, _MAX_ANGLE = 12.0, 3.0, 45.0
+#: Share of the span of inverse depths added at either end.
+_MARGIN = 0.25
+#: How far one step from plane to plane moves the match, in pixels.
+_STEP = 0.75
+
 
 def visible_points(camera: Camera, points: Array) -> tuple[Array, Array]:
     """Points [N, 3] that fall inside the image of a camera, and their depths [M]."""
@@ -52,29 +59,20 @@ def _axes_meet(cameras: list[Camera]) -> Array:
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
 
 
-def select_sources(
-    index: int,
-    cameras: list[Camera],
-    points: Array,
-    count: int,
-    best_angle: float = 12.0,
-    min_angle: float = 3.0,
-    max_angle: float = 45.0,
-) -> list[int]:
+def select_sources(index: int, cameras: list[Camera], points: Array, count: int) -> list[int]:
     """Choose the views to compare one view with.
 
     Each candidate scores its overlap (share of the view's points that it sees) times how near the
     median triangulation angle is to the best one. The second and later choices lose half their
     score for lying on the side of a view that is already chosen, so that what one side hides the
-    other can show.
+    other can show. If no view lies between the angles allowed, the one nearest to them is taken,
+    unless it has no baseline at all.
 
     Args:
         index: the reference.
         cameras: V cameras.
         points: [M, 3] world points that the reference sees.
         count: at most this many.
-        best_angle, min_angle, max_angle: degrees. If no view lies between the limits, the one
-            nearest to them is taken, unless it has no baseline at all.
 
     Returns:
         Indices, best first.
@@ -91,17 +89,17 @@ def select_sources(
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
         angle = float(np.median(np.degrees(np.arccos(np.clip((rays * towards).sum(1), -1, 1)))))
         overlap = len(visible_points(camera, points)[0]) / len(points)
-        width = 6.0 if angle < best_angle else 15.0
-        score = overlap * float(np.exp(-0.5 * ((angle - best_angle) / width) ** 2))
+        width = 6.0 if angle < _BEST_ANGLE else 15.0
+        score = overlap * float(np.exp(-0.5 * ((angle - _BEST_ANGLE) / width) ** 2))
         side = camera.centre - reference.centre
         side = side - (side @ (middle - reference.centre)) * (middle - reference.centre) / max(
             float((middle - reference.centre) @ (middle - reference.centre)), 1e-12
         )
         side /= max(float(np.linalg.norm(side)), 1e-12)
-        if min_angle <= angle <= max_angle and overlap > 0.05:
+        if _MIN_ANGLE <= angle <= _MAX_ANGLE and overlap > 0.05:
             candidates.append((score, other, side))
         elif angle > 0.3 and overlap > 0.05:
-            miss = min_angle - angle if angle < min_angle else angle - max_angle
+            miss = _MIN_ANGLE - angle if angle < _MIN_ANGLE else angle - _MAX_ANGLE
             spares.append((-miss, other, side))
     if not candidates:
         spares.sort(key=lambda entry: (-entry[0], entry[1]))
@@ -120,16 +118,13 @@ def select_sources(
     return chosen
 
 
-def inverse_depth_range(
-    camera: Camera, own: Array, everything: Array, margin: float
-) -> tuple[float, float]:
+def inverse_depth_range(camera: Camera, own: Array, everything: Array) -> tuple[float, float]:
     """Between which inverse depths to look for the surface.
 
     Args:
         camera: the view.
         own: [M, 3] world points that it sees.
         everything: [N, 3] all known points; those inside the image count too.
-        margin: how much of the span to add at either end.
 
     Returns:
         Inverse z-depth of the farthest and of the nearest plane.
@@ -140,7 +135,7 @@ def inverse_depth_range(
     inverse = 1.0 / depth
     far, near = np.percentile(inverse, [1.5, 98.5])
     # A handful of points says little about the ends.
-    share = margin * (2.0 if len(depth) < 50 else 1.0)
+    share = _MARGIN * (2.0 if len(depth) < 50 else 1.0)
     span = max(near - far, 0.1 * near)
     return max(far - share * span, 0.2 * far), near + share * span
 
@@ -149,11 +144,10 @@ def plane_count(
     camera: Camera,
     sources: list[Camera],
     inverse_range: tuple[float, float],
-    step_px: float,
     least: int,
     most: int,
 ) -> int:
-    """Planes so that one step moves the match by about `step_px` pixels in the farthest source."""
+    """Planes so that one step moves the match by about `_STEP` pixels in the farthest source."""
     corners = np.array(
         [[u * camera.width, v * camera.height, 1.0] for u in (0.25, 0.5, 0.75) for v in (0.3, 0.7)]
     )
@@ -168,4 +162,4 @@ def plane_count(
         moved = np.linalg.norm(ends[1] - ends[0], axis=1)
         if np.isfinite(moved).any():
             longest = max(longest, float(np.nanmedian(moved)))
-    return int(np.clip(np.ceil(longest / step_px) + 1, least, most))
+    return int(np.clip(np.ceil(longest / _STEP) + 1, least, most))

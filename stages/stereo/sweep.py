@@ -25,6 +25,8 @@ UNUSABLE = np.float32(-1e6)
 NEUTRAL_COST = np.float32(1.0)
 #: Cost of a source that can't be compared: above all that can (1.2).
 _UNSEEN = np.float32(2)
+#: Least grey variance in the denominator, so that noise does not correlate.
+_LEAST_VARIANCE = np.float32(2e-5)
 _ROWS, _COLUMNS = TILE
 
 
@@ -249,7 +251,6 @@ def cost_volume(
     sizes: Array,
     homographies: Array,
     window: int,
-    var_min: float = 2e-5,
     ranges: Integers | None = None,
     buffer: Buffer | None = None,
 ) -> Volume:
@@ -266,7 +267,6 @@ def cost_volume(
         sizes: [S, 2] float32 (height, width) of each source.
         homographies: [D, S, 9] float32 from `plane_homographies`.
         window: side of the window in pixels, odd.
-        var_min: least variance in the denominator, so that noise does not correlate.
         ranges: [T, 2] int64 for every tile (row by row) its first plane and the one after its
             last; None: all planes.
         buffer: where the volume goes; None: into memory of its own.
@@ -282,6 +282,6 @@ def cost_volume(
     each(
         _sweep_tile, down * across, across, np.ascontiguousarray(reference, np.float32),
         usable.astype(np.float32), sources, sizes, homographies, int(window) // 2,
-        np.float32(var_min), volume.starts, volume.ranges, volume.values,
+        _LEAST_VARIANCE, volume.starts, volume.ranges, volume.values,
     )  # fmt: skip
     return volume

@@ -236,7 +236,7 @@ def test_depth_range_holds_the_scene_though_sparse_points_have_outliers(three):
     cameras, _, depths, sparse, _, _ = three
     points = scene_points(cameras, sparse)
     points[1] = np.concatenate([points[1], [[*cameras[1].centre[:2], 0.01]]])
-    far, near = inverse_depth_range(cameras[1], points[1], np.concatenate(points), 0.25)
+    far, near = inverse_depth_range(cameras[1], points[1], np.concatenate(points))
     assert 1 / far > depths[1].max()
     assert depths[1].min() * 0.5 < 1 / near < depths[1].min()
 
