@@ -12,6 +12,9 @@ from pipeline.geometry.graph import Pair
 
 Array = npt.NDArray[np.float32]
 
+#: Of what was filled in, one pixel in so many (in x and y) becomes a point.
+FILL_STEP = 4
+
 
 def depth_points(
     image: Array, depth: Array, normal: Array, confidence: Array, camera: Camera, step: int = 1

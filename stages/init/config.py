@@ -11,16 +11,12 @@ from pydantic_core import PydanticCustomError
 from pipeline.artifacts.dental.fdi import ALL_TEETH, THE_NUMBERS
 from pipeline.stage import StageConfig, runtime
 from pipeline.untrusted.paths import GivenPath, user_path
-from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.surface.options import SurfaceOptions
-from stages.init.sfm.options import RefinementOptions
 from stages.pointmaps.options import PointmapOptions
 from stages.stereo.options import DenseOptions
 
 #: Defaults are said once, where they were measured.
 DENSE = DenseOptions()
-ARCH = ArchOptions()
-REFINEMENT = RefinementOptions()
 SURFACE = SurfaceOptions()
 POINTMAPS = PointmapOptions()
 
@@ -74,20 +70,8 @@ class DenseConfig(StageConfig):
 class RefinementConfig(StageConfig):
     """The last adjustment of cameras from features, and what is tried where it fails."""
 
-    loss_scale: float = Field(
-        REFINEMENT.loss_scale, gt=0, le=20, description="robust loss from this error on, px at 512"
-    )
     refine_distortion: Literal["auto", "always", "never"] = Field(
         "auto", description="estimate a radial coefficient per lens; auto: where it helps clearly"
-    )
-    distortion_views: int = Field(
-        REFINEMENT.distortion_views, ge=2, le=1000, description="views that a lens needs for it"
-    )
-    distortion_observations: int = Field(
-        REFINEMENT.distortion_observations, ge=20, description="observations it needs for it"
-    )
-    distortion_gain: float = Field(
-        REFINEMENT.distortion_gain, ge=0, lt=1, description="share by which the error must fall"
     )
     unroll: bool = Field(True, description="where links are missing, look for rolled photographs")
 
@@ -173,30 +157,6 @@ class DentalConfig(StageConfig):
     )
     tooth_widths: dict[ToothNumber, Annotated[float, Field(gt=2, lt=20)]] = Field(
         {}, description="known mesiodistal widths in mm by FDI number, for the scale"
-    )
-    focal_per_side: float = Field(
-        ARCH.focal_per_side, ge=0.3, le=10, description="focal length expected over the long side"
-    )
-    focal_deviation: float = Field(
-        ARCH.focal_deviation, gt=0, le=1, description="its relative standard deviation"
-    )
-    distance: float = Field(ARCH.distance, gt=20, le=2000, description="camera distance, mm")
-    distance_deviation: float = Field(
-        ARCH.distance_deviation, gt=0, le=1, description="its relative standard deviation"
-    )
-    side_yaw: float = Field(ARCH.side_yaw, ge=5, le=90, description="yaw of side views, degrees")
-    landmark_deviation: float = Field(
-        ARCH.landmark_deviation, gt=0, le=10,
-        description="how far teeth lie from the textbook arch, mm",
-    )  # fmt: skip
-    dense_rounds: int = Field(
-        ARCH.dense_rounds, ge=0, le=10, description="rounds of matching on the unrolled arch"
-    )
-    min_margin: float = Field(
-        ARCH.min_margin, ge=0, description="least lead of a labelling over the next one"
-    )
-    max_error: float = Field(
-        ARCH.max_error, gt=0, le=1, description="largest landmark error over the band of teeth"
     )
     accept_doubtful: bool = Field(
         False, description="go on with a doubtful result; the doubts become warnings"
@@ -296,9 +256,6 @@ class InitConfig(StageConfig):
     peak_threshold: float = Field(0.002, gt=0, le=0.1, description="SIFT contrast threshold")
     max_features: int = Field(6000, ge=100, le=50_000, description="features per copy")
     match_ratio: float = Field(0.88, gt=0, le=1, description="ratio test: best over next match")
-    overlap_features: int = Field(800, ge=50, le=20_000, description="features per overlap test")
-    overlap_matches: int = Field(80, ge=1, description="overlap from which plain features do")
-    pairs_per_view: int = Field(6, ge=1, le=1000, description="pairs matched fully, per view")
     window: int = Field(4, ge=1, le=1000, description="neighbours in a video that are tried")
     max_error: float = Field(2.0, gt=0, le=50, description="epipolar error, px at 512 px width")
     min_inliers: int = Field(25, ge=8, le=10_000, description="least agreeing matches of a pair")
@@ -306,7 +263,6 @@ class InitConfig(StageConfig):
         65, ge=1, description="agreeing matches times the square of the share that moves together, "
         "which a pair needs to link photographs; lower risks wrong scenes",
     )  # fmt: skip
-    cycle_angle: float = Field(8.0, gt=0, le=180, description="rotation error around a cycle, deg")
     mapper: Literal["auto", "incremental", "global"] = Field(
         "auto", description="COLMAP's mapper; auto: incremental, global where views are left out"
     )
@@ -318,12 +274,6 @@ class InitConfig(StageConfig):
         RefinementConfig.model_validate({}), description="the last adjustment; rolled photographs"
     )
     max_points: int = Field(400_000, ge=1000, le=20_000_000, description="points kept at most")
-    fill_step: int = Field(
-        4, ge=0, le=64, description="every n-th pixel without stereo depth is filled in; 0: none"
-    )
-    min_dense_points: int = Field(
-        5000, ge=0, description="with fewer dense points the sparse ones are added"
-    )
     match_pictures: int = Field(
         12, ge=0, le=1000, description="pairs of photographs drawn with their matches; 0: none"
     )

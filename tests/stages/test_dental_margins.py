@@ -152,9 +152,9 @@ def test_numbers_that_a_near_rival_has_otherwise_are_marked() -> None:
 
 
 def test_it_is_said() -> None:
-    near = cast(Any, SimpleNamespace(fit=SimpleNamespace(figures={"numbers_margin": 5.2})))
-    (sentence,) = numbered_otherwise(near, 6.0)
+    def said(figures: dict[str, float]) -> list[str]:
+        return numbered_otherwise(cast(Any, SimpleNamespace(fit=SimpleNamespace(figures=figures))))
+
+    (sentence,) = said({"numbers_margin": 5.2})
     assert "margin 5, wanted 6" in sentence
-    assert numbered_otherwise(near, 5.0) == []
-    none = cast(Any, SimpleNamespace(fit=SimpleNamespace(figures={})))
-    assert numbered_otherwise(none, 6.0) == []
+    assert said({"numbers_margin": 6.2}) == said({}) == []

@@ -331,12 +331,11 @@ def test_photographs_that_take_no_part_do_not_speak_of_several_days():
 def test_settings_reach_the_fit():
     views = photographs()
     dentitions = list(read_teeth().views)
-    options = options_of(views, dentitions, order="right, frontal,left", min_margin=21)
+    options = options_of(views, dentitions, order="right, frontal,left")
     assert options.order == ("right", "frontal", "left")
     placed = Views((views.views[0], views.views[2]))
     some = options_of(views, dentitions[:2], placed, order="right,frontal,left")
     assert some.order == ("right", "left")
-    assert options.min_margin == 21
     with pytest.raises(RequestError, match="names 2 photographs"):
         options_of(views, dentitions, order="right,left")
     assert place.surface_options(DentalConfig(gum_height=2)).gum_height == 2

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from stages.init.sfm import refine
 from stages.init.sfm.matching.two_view import Correspondences, coherent_matches
 from stages.init.sfm.options import ClassicalOptions, RefinementOptions
 from stages.init.sfm.refine import bundle_adjust, refine_solution, robust_cost
@@ -171,7 +172,8 @@ def test_distortion_can_be_switched_off(tmp_path):
     assert set(found.distortions.values()) == {0.0}
 
 
-def test_a_lens_that_saw_little_keeps_its_pinhole(tmp_path):
+def test_a_lens_that_saw_little_keeps_its_pinhole(tmp_path, monkeypatch):
+    monkeypatch.setattr(refine, "DISTORTION_OBSERVATIONS", 1_000_000)
     given = through_a_bent_lens(make_scene([-22, 0, 20], count=250)[0], -0.25)
-    _, found = solved(given, tmp_path, distortion_observations=1_000_000)
+    _, found = solved(given, tmp_path)
     assert set(found.distortions.values()) == {0.0}

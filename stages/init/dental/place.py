@@ -81,7 +81,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
         *left_out(names, teeth), *teeth.fit.doubts, *only_two(names, teeth),
         *in_another_light(names, teeth),
         *turned_back(names, teeth), *misnamed(names, teeth),
-        *numbered_otherwise(teeth, config.dental.min_margin),
+        *numbered_otherwise(teeth),
         *of_several_days(taking_part(views, teeth.dentitions)),
     ):  # fmt: skip
         context.warn(doubt)
@@ -169,14 +169,14 @@ def in_another_light(names: list[str], teeth: Reconstruction) -> list[str]:
     ]
 
 
-def numbered_otherwise(teeth: Reconstruction, min_margin: float) -> list[str]:
+def numbered_otherwise(teeth: Reconstruction) -> list[str]:
     """What to say where other numbers of teeth that one photograph shows are nearly as good."""
-    margin = teeth.fit.figures.get("numbers_margin", np.inf)
-    if margin >= min_margin:
+    margin, wanted = teeth.fit.figures.get("numbers_margin", np.inf), ArchOptions.min_margin
+    if margin >= wanted:
         return []
     return [
         f"Another numbering explains the photographs nearly as well (margin {margin:.0f}, wanted "
-        f"{min_margin:.0f}). It renames teeth that one photograph alone shows, such as those "
+        f"{wanted:.0f}). It renames teeth that one photograph alone shows, such as those "
         "behind a tooth that may be missing: the scene does not rest on it, their numbers are "
         "marked. Check them on the page check.html."
     ]
@@ -335,19 +335,17 @@ def arch_options(
     Raises:
         RequestError: an order that doesn't fit the photographs.
     """
-    config: DentalConfig = context.config.dental
-    shared = set(DentalConfig.model_fields) & set(ArchOptions.__dataclass_fields__)
-    settings = {name: getattr(config, name) for name in sorted(shared)}
-    if config.order is not None:
+    order = context.config.dental.order
+    if order is not None:
         every = context.load("views").views
-        if len(config.order) != len(every):
+        if len(order) != len(every):
             raise RequestError(
-                f"init.dental.order names {len(config.order)} photographs "
-                f"({','.join(config.order)}), but there are {len(every)}."
+                f"init.dental.order names {len(order)} photographs ({','.join(order)}), but there "
+                f"are {len(every)}."
             )
-        said = {view.name: role for view, role in zip(every, config.order, strict=True)}
-        settings["order"] = tuple(said[view.name] for view in views.views)
-    return ArchOptions(**settings, one_sitting=one_sitting(taking_part(views, dentitions)))
+        said = {view.name: role for view, role in zip(every, order, strict=True)}
+        order = tuple(said[view.name] for view in views.views)
+    return ArchOptions(order=order, one_sitting=one_sitting(taking_part(views, dentitions)))
 
 
 def surface_options(config: DentalConfig) -> SurfaceOptions:

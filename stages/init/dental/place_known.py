@@ -100,7 +100,7 @@ def from_known_teeth(
         held.placed(context, posed, cameras, config.dental.accept_doubtful),
         replace(held.surface, past_row=None), context.threads, context.progress, jaws,
     )  # fmt: skip
-    for doubt in (*teeth.fit.doubts, *numbered_otherwise(teeth, config.dental.min_margin)):
+    for doubt in (*teeth.fit.doubts, *numbered_otherwise(teeth)):
         context.warn(doubt)
     left_out = [photo_name(view) for view in views.views if view.name not in known]
     if left_out:
@@ -219,11 +219,11 @@ def _write(
         scale=np.full(len(surface.positions), config.dental.cloud_spacing * scale, np.float32),
     )
     clouds = [points]
-    if config.fill_step and not masks:
+    if not masks:
         clouds += [
             cloud.depth_points(
                 view.image, np.where(found.depth > 0, np.float32(0), found.filled), found.normal,
-                found.confidence, camera, config.fill_step,
+                found.confidence, camera, cloud.FILL_STEP,
             )
             for view, found, camera in zip(placement.views, dense, cameras, strict=True)
         ]  # fmt: skip

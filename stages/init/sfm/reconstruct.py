@@ -49,6 +49,11 @@ from stages.init.sfm.solver import Progress, Solver, known_focal, unknown_focal
 
 #: Defaults of the last adjustment.
 REFINEMENT = RefinementOptions()
+#: Features of each view that tell how much two overlap; from so many matches among them on plain
+#: features do, without squeezed copies.
+OVERLAP_FEATURES, OVERLAP_MATCHES = 800, 80
+#: Pairs that are matched fully, for each view.
+PAIRS_PER_VIEW = 6
 #: How many pairs are asked whether there is any parallax.
 PAIRS_CHECKED_FOR_DEPTH = 4
 #: Pixels below which nothing moved between two photographs, and evidence that makes it certain.
@@ -158,7 +163,7 @@ def reconstruct(
         features = list(plain_features or ()) if plain == (1.0,) and not any(rolls) else []
         features = features or find_features(grays, valid, first, threads, progress, rolls, scratch)
         counts = overlaps(features, ordered, options)
-        near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
+        near = [pair for pair, count in counts.items() if count >= OVERLAP_MATCHES]
         found = match_pairs(features, near, options, pixel, threads, progress)
         solver = solver_of(found)
         lacking = weakly_linked(solver.links(), len(grays))
@@ -328,7 +333,7 @@ def match_views(
     Views near each other match without the squeezed copies, at a fifth of the cost.
     """
     counts = overlaps(features, ordered, options)
-    near = [pair for pair, count in counts.items() if count >= options.overlap_matches]
+    near = [pair for pair, count in counts.items() if count >= OVERLAP_MATCHES]
     plain = [feature.plain() for feature in features]
     found = match_pairs(plain, near, options, pixel, threads, progress)
     far = [pair for pair in counts if pair not in found]
@@ -340,8 +345,8 @@ def overlaps(features: list[Features], ordered: bool, options: ClassicalOptions)
     """The pairs of views worth matching, with the count that says how much they overlap."""
     pairs = candidate_pairs(len(features), ordered, options.window)
     with threadpool_limits(1, "blas"):
-        counts = overlap_counts(features, pairs, options.overlap_features)
-    chosen = select_pairs(counts, len(features), options.pairs_per_view)
+        counts = overlap_counts(features, pairs, OVERLAP_FEATURES)
+    chosen = select_pairs(counts, len(features), PAIRS_PER_VIEW)
     return {pair: counts[pair] for pair in chosen}
 
 

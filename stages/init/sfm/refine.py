@@ -20,6 +20,12 @@ from stages.init.sfm.undistort import distort_pixels
 Array = npt.NDArray[np.float64]
 Found = TypeVar("Found", Solution, Solution | None)
 
+#: Reprojection error, pixels at the reference size, from which on it counts less than squared.
+LOSS_SCALE = 0.5
+#: Placed views and observations that a lens needs for a radial coefficient, and the share by which
+#: the (robust) sum of squared errors must fall with it. Straight lenses gain up to .002, those of
+#: phones and compact cameras .08 to .33, and a strong barrel that is seen within 10 degrees .015.
+DISTORTION_VIEWS, DISTORTION_OBSERVATIONS, DISTORTION_GAIN = 3, 300, 0.01
 #: A lens that shrinks its corners, relative to its middle, to less than this share is a wrong guess
 #: (fisheye lenses need another model).
 LEAST_STRETCH = 0.3
@@ -52,7 +58,7 @@ def refine_solution(
         best: the reconstruction.
         free: the focal lengths may change.
     """
-    scale = options.loss_scale * solver.pixel
+    scale = LOSS_SCALE * solver.pixel
     heeded = _near_exif(solver, best)
 
     def near_exif(find: Callable[[bool], Found]) -> Found:
@@ -70,12 +76,12 @@ def refine_solution(
     plain = adjusted(best, None)
     if not solver.sane(plain):
         plain = best
-    able = _lenses_seen_enough(solver, best, options)
+    able = _lenses_seen_enough(solver, best)
     if options.refine_distortion == "never" or not any(able):
         return plain
     start: Distortions = [0.0 if enough else None for enough in able]
     bent = adjusted(best, start)
-    gained = robust_cost(bent, scale) < (1 - options.distortion_gain) * robust_cost(plain, scale)
+    gained = robust_cost(bent, scale) < (1 - DISTORTION_GAIN) * robust_cost(plain, scale)
     if not _believable(solver, bent) or not (gained or options.refine_distortion == "always"):
         return plain
     # The pairs verified and the points found anew: those at the rim were taken for errors.
@@ -107,7 +113,7 @@ def with_zoomed(
         solver, best, options: as in `refine_solution`.
         free: the focal lengths may change; if not, none is asked.
     """
-    scale = options.loss_scale * solver.pixel
+    scale = LOSS_SCALE * solver.pixel
     if not free or len(best.poses) <= BESIDES_ZOOMED:
         return solver, best
     own = {view: own_focal(solver.given, best, view, scale) for view in sorted(best.poses)}
@@ -167,17 +173,15 @@ def robust_cost(solution: Solution, scale: float) -> float:
     return float(2 * scale**2 * np.sum(np.sqrt(1 + squares) - 1))
 
 
-def _lenses_seen_enough(
-    solver: Solver, solution: Solution, options: RefinementOptions
-) -> list[bool]:
+def _lenses_seen_enough(solver: Solver, solution: Solution) -> list[bool]:
     views = np.zeros(len(solver.given.lenses), np.int64)
     observations = np.zeros(len(solver.given.lenses), np.int64)
     for view in solution.poses:
         lens = solver.given.lens_of_view[view]
         views[lens] += 1
         observations[lens] += int((solution.observed_view == view).sum())
-    enough = views >= options.distortion_views
-    return [bool(b) for b in enough & (observations >= options.distortion_observations)]
+    enough = views >= DISTORTION_VIEWS
+    return [bool(b) for b in enough & (observations >= DISTORTION_OBSERVATIONS)]
 
 
 def _near_exif(solver: Solver, solution: Solution) -> bool:

@@ -86,7 +86,6 @@ class Solver:
         kept = trusted_edges(
             edges, self.view_count,
             min_evidence=options.min_evidence, min_inliers=options.min_inliers,
-            cycle_angle=options.cycle_angle,
         )  # fmt: skip
         solution = map_views(
             self.given, {pair: edges[pair] for pair in kept}, focals,

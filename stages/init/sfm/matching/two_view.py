@@ -26,6 +26,11 @@ MAX_SAMPLED_MATCHES = 800
 #: Random samples at least. The confidence asks for more where the matches need them; COLMAP's own
 #: least of 1000 takes four times as long and gave the same poses on all pairs of a scan video.
 MIN_TRIALS = 100
+#: So many other matches nearby have to move along with one that is believed.
+TOGETHER = 2
+#: A pair beside the spanning tree counts where its matches move together by more than this share,
+#: and the rotation around the cycle that it closes is off by less than so many degrees.
+CYCLE_COHERENCE, CYCLE_ANGLE = 0.5, 8.0
 
 
 @dataclass(frozen=True)
@@ -202,16 +207,16 @@ def homography_share(
 
 
 def coherent_matches(
-    positions_i: Array, positions_j: Array, radius: float, neighbours: int = 2
+    positions_i: Array, positions_j: Array, radius: float
 ) -> npt.NDArray[np.bool_]:
-    """Tell the matches [M, 2] that at least `neighbours` others within `radius` move along with.
+    """Tell the matches [M, 2] that at least `TOGETHER` others within `radius` move along with.
 
     Two matches move together if their displacements differ by less than radius / 8 plus .35 of
     their distance: what a surface that turns by up to about 30 degrees does.
     """
     support = np.zeros(len(positions_i), np.int64)
     if len(positions_i) < 2:
-        return support >= neighbours
+        return support >= TOGETHER
     near = cKDTree(positions_i).query_pairs(radius, output_type="ndarray")
     apart = np.linalg.norm(positions_i[near[:, 0]] - positions_i[near[:, 1]], axis=1)
     moved = positions_j - positions_i
@@ -219,7 +224,7 @@ def coherent_matches(
     # Matches on the same spot say nothing about each other.
     together = near[(apart > radius / 20) & (differ < radius / 8 + 0.35 * apart)]
     np.add.at(support, together.ravel(), 1)
-    return support >= neighbours
+    return support >= TOGETHER
 
 
 def unrolled(positions: Array, degrees: float) -> Array:
@@ -252,13 +257,11 @@ def trusted_edges(
     *,
     min_evidence: float = 65.0,
     min_inliers: int = 25,
-    cycle_coherence: float = 0.5,
-    cycle_angle: float = 8.0,
 ) -> list[Pair]:
     """Choose the pairs to reconstruct from, sorted.
 
     A maximum spanning forest of pairs with enough evidence; any other pair only if the rotation
-    around the cycle that it closes is right within `cycle_angle` degrees.
+    around the cycle that it closes is right within `CYCLE_ANGLE` degrees.
     """
     enough = {pair: edge for pair, edge in edges.items() if len(edge.inliers) >= min_inliers}
     believed = {
@@ -276,6 +279,6 @@ def trusted_edges(
             if (i, j) in kept or i not in rotations or j not in rotations:
                 continue
             error = angle_between(edge.rotation @ rotations[i], rotations[j])
-            if error < cycle_angle and edge.coherence > cycle_coherence:
+            if error < CYCLE_ANGLE and edge.coherence > CYCLE_COHERENCE:
                 kept.add((i, j))
     return sorted(kept)
