@@ -45,8 +45,7 @@ def whole_fits() -> None:
         cameras = [_camera(k) for k in range(3)]
         config = FitConfig(
             iterations=8, initial_points=POINTS, light=light,
-            densify=not held, lambda_depth=0.1, hold_colors_until=0.0,
-            backend="cpu",
+            densify=not held, lambda_depth=0.1, backend="cpu",
         )  # fmt: skip
         fit(
             [View(name, _image()) for name in names], cameras, _points(), None,

@@ -123,7 +123,7 @@ def test_a_stopped_lit_fit_resumes_to_the_same_bytes(tmp_path) -> None:
         "densification_interval": 10, "max_gaussians": 3500, "densify_grad_threshold": 1e-7,
         "densify_abs_grad_threshold": 1e-7, "densify_until_iter": 40,
         "optimize_poses": True, "optimize_focal": True,
-        "hold_surface": True, "hold_colors_until": 0.1, "preview_every": 15,
+        "hold_surface": True, "preview_every": 15,
     }  # fmt: skip
     whole = context(tmp_path / "a", views, cameras, points, threads=1, **config)
     FitStage().run(whole)

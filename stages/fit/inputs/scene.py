@@ -34,6 +34,9 @@ EXTENT_MARGIN = 1.1
 MIN_EXTENT = 0.25
 #: where fewer of the points than this share are trusted, confidence means something else
 MIN_TRUSTED = 0.02
+#: how far behind measured points a filled one may be, as a share of the depth, to be taken for the
+#: same surface (and left out)
+SAME_SURFACE = 0.03
 #: surfaces are looked up at this fraction of the image size: measured points are not everywhere
 COARSE_DEPTH = 4
 
@@ -129,7 +132,7 @@ def prepare(
     trusted = trusted_points(cloud, settings.trusted_confidence)
     if not trusted.all():
         keep = trusted | ~out_of_place(
-            cloud.positions, cloud.positions[trusted], local, settings.fill_tolerance
+            cloud.positions, cloud.positions[trusted], local, SAME_SURFACE
         )
         cloud, trusted = cloud.select(keep), trusted[keep]
     flows = flows_between(views, flow) if settings.lambda_flow > 0 else {}

@@ -15,7 +15,6 @@ from stages.fit.settings import (
     AutoColour,
     AutoFloat,
     PartSettings,
-    Positive,
     Weight,
     Whole,
     automatic,
@@ -23,6 +22,9 @@ from stages.fit.settings import (
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
+
+#: learning rate of the logarithm of the factor that all views' focal lengths share
+FOCAL_RATE = 1e-4
 
 
 class Background(
@@ -168,15 +170,13 @@ class Focal(Part, switch="optimize_focal", on=True, off=False):
     class Settings(PartSettings):
         optimize_focal: bool = False
         """refine the focal length as well, by one factor that all views share"""
-        focal_lr: Positive = 1e-4
-        """learning rate of that factor's logarithm"""
 
     def follow(self, fit: Trainer, step: Step) -> None:
         found = [(step.gradients.focal, step.viewpoint)]
         if step.following is not None:  # flow leads from one view to another, and both have it
             found.append((step.gradients.next_focal, step.following))
         by_log = sum(float(by @ view.intrinsics[:2].astype(np.float64)) for by, view in found)
-        fit.focal.step(by_log, self.settings.focal_lr)
+        fit.focal.step(by_log, FOCAL_RATE)
 
 
 class PoseOptimizer:

@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
 #: Nearest Gaussians whose colours say what a colour may be.
 NEIGHBOURS = 8
+#: Holds colours where they are: as if this many pixels of each view showed them so.
+DAMPING = 0.01
+#: Colours stay this near to the range of those that the neighbours had. Damped so little, what
+#: photographs hardly show would else get loud ones that none has, and other viewpoints do show.
+REACH = 0.1
 
 
 class Colours(Part, switch="colour_steps", on=4, off=0):
@@ -36,12 +41,6 @@ class Colours(Part, switch="colour_steps", on=4, off=0):
     class Settings(PartSettings):
         colour_steps: Whole = 4
         """steps of conjugate gradients that solve for the colours at the end; 0: none"""
-        colour_damping: Positive = 0.01
-        """holds colours where they are: as if this many pixels of each view showed them so"""
-        # damped this little, what photographs hardly show would else get loud colours that no
-        # photograph has, and that other viewpoints do show
-        colour_reach: Positive = 0.1
-        """they stay this near to the range of colours that the eight nearest Gaussians had"""
         # on photographs with noise of .06, albedos were else off by .053, not by .027 as without
         colour_spread: Positive = 0.055
         """how far they may be expected to move (standard deviation): noise of the photographs,
@@ -70,12 +69,12 @@ class Colours(Part, switch="colour_steps", on=4, off=0):
             return total
 
         noise = numerics.colours.deviation(rest)
-        damping = (s.colour_damping + (noise / s.colour_spread) ** 2) * len(looks)
+        damping = (DAMPING + (noise / s.colour_spread) ** 2) * len(looks)
         move = numerics.colours.solved(normal, wanted, damping, s.colour_steps)
         constant = fit.packed[:, HARMONICS : HARMONICS + 3]
         colours = constant * C0 if light is None else light.material[:, :3]
         move = numerics.colours.bounded(
-            move, colours, fit.packed[:, :3], NEIGHBOURS, s.colour_reach
+            move, colours, fit.packed[:, :3], NEIGHBOURS, REACH
         )  # fmt: skip
         if light is None:
             constant += move / C0

@@ -12,17 +12,16 @@ places where they gain least.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
 from stages.fit import numerics
 from stages.fit.arrays import Array, Floats
 from stages.fit.parts.base import Figures, Part
 from stages.fit.parts.start import coarse_factors
 from stages.fit.parts.surface import Surface
-from stages.fit.settings import AutoFloat, AutoInt, PartSettings, Positive, automatic
+from stages.fit.settings import AutoFloat, AutoInt, PartSettings, automatic
 from stages.photographs.noise import noise_level
 
 if TYPE_CHECKING:
@@ -32,6 +31,10 @@ if TYPE_CHECKING:
 LAST = 0.6
 #: room for more, as a share of all that there may be, below which a split is not worth its time
 WORTH = 0.05
+#: an error counts above so many times the photograph's own noise
+NOISE = 1.5
+#: Gaussians are split along axes whose standard deviation is more pixels than this
+SIZE = 0.5
 
 
 class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")):
@@ -52,14 +55,10 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         detail_density: AutoFloat = automatic({5: 0.3, 6: 0.6}, ge=None, gt=0)
         """there are at most so many Gaussians for each pixel of a photograph; the largest errors
         come first"""
-        detail_noise: Annotated[float, Field(ge=0)] = 1.5
-        """an error counts above so many times the photograph's own noise"""
         # between few views that are close to each other, more Gaussians for what hardly shows cost
         # unseen views .1 dB; on a held surface nothing
         detail_error: AutoFloat = automatic({3: 0.03}, held=0.01, le=1)
-        """and above this (of 0..1)"""
-        detail_size: Positive = 0.5
-        """Gaussians are split along axes whose standard deviation is more pixels than this"""
+        """an error counts above this (of 0..1), and above the photograph's own noise"""
 
     def __init__(self, fit: Trainer) -> None:
         super().__init__(fit)
@@ -81,7 +80,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
         s: Any = self.settings
         pixels = max(target[1].width * target[1].height for target in fit.targets)
         most = int(s.detail_density * pixels)
-        excess, seen = unexplained(fit, factor, s.detail_noise, s.detail_error)
+        excess, seen = unexplained(fit, factor, NOISE, s.detail_error)
         rows = np.flatnonzero(seen >= s.final_prune_contribution)
         if most - len(rows) < WORTH * most:
             return
@@ -89,7 +88,7 @@ class Detail(Part, switch="detail", on=True, off=False, kept=("added", "latest")
             # what hides behind the others takes time, and the places of those that show
             fit.replace(np.ascontiguousarray(fit.packed[rows]), rows, np.zeros(len(rows), bool))
             excess = excess[rows]
-        axes = numerics.detail.wide_axes(fit.packed, self._pixel(fit, factor), s.detail_size)
+        axes = numerics.detail.wide_axes(fit.packed, self._pixel(fit, factor), SIZE)
         wanted = (excess > 0)[:, None]
         axes = numerics.detail.within(axes & wanted, excess, most - len(fit.packed))
         if not axes.any():

@@ -16,7 +16,6 @@ from stages.fit.settings import (
     AutoFloat,
     Count,
     PartSettings,
-    Weight,
     automatic,
 )
 
@@ -39,6 +38,10 @@ else:
 #: steps after which normals are made unit again: only their direction means something, but their
 #: length is what Adam's step is relative to
 RENORMALISE = 10
+#: learning rates of logit k and of the lobes' log widths, and of the falloff's exponent
+RATE, FALLOFF_RATE = 1e-2, 5e-3
+#: what these, albedos' and normals' rates have fallen to at the end
+DECAY = 0.1
 
 
 class Light(
@@ -73,15 +76,9 @@ class Light(
         """learning rate of albedos"""
         light_normal_lr: AutoFloat = automatic({3: 5e-3}, held=4e-3)
         """learning rate of the normals that are lit"""
-        light_lr: Weight = 1e-2
-        """learning rate of logit k and of the lobes' log widths"""
-        light_falloff_lr: Weight = 5e-3
-        """learning rate of the falloff's exponent"""
         light_strength_lr: AutoFloat = automatic({3: 2e-2}, held=0.0)
         """learning rate of the lobes' log strengths: views too far apart to share a highlight bend
         normals until any strength fits"""
-        light_lr_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
-        """what the light's, albedos' and normals' rates have fallen to at the end"""
         light_trial_iterations: Count = 300
         """steps of each trial of light: auto"""
         light_trial_factor: Annotated[int, Field(ge=1, le=16)] = 4
@@ -132,7 +129,7 @@ class Light(
         gradient[:, 11:14] = 0
         if variation is not None:
             variation.add(fit, self.material, 0, 3, result.material)
-        fall = s.light_lr_decay**step.done
+        fall = DECAY**step.done
         rates = np.empty(6, np.float32)
         rates[:3], rates[3:] = s.light_albedo_lr * fall, s.light_normal_lr * fall
         self.by_normal = result.material[:, 3:]
@@ -145,15 +142,11 @@ class Light(
 
     def _step_light(self, gradient: Array, fall: float) -> None:
         """Adam on logit k, p, and the logarithms of the lobes' widths and strengths."""
-        s = self.settings
-        k = self.values[0]
+        k, by_strength = self.values[0], self.settings.light_strength_lr
         slope = self.values.copy()  # of the values by what Adam moves
         slope[0], slope[1] = k * (1 - k), 1
         g = gradient * slope
-        rates = np.array(
-            [s.light_lr, s.light_falloff_lr, s.light_lr, s.light_strength_lr, s.light_lr,
-             s.light_strength_lr]
-        )  # fmt: skip
+        rates = np.array([RATE, FALLOFF_RATE, RATE, by_strength, RATE, by_strength])
         step, self.first, self.second = numerics.moments.adam_step(
             g, self.first, self.second, self.adam.steps, fall * rates, 0.99
         )

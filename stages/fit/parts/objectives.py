@@ -5,15 +5,14 @@ Depth and flow take turns, each twice as heavy: they change slowly, and cost pla
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
 from stages.fit import numerics
 from stages.fit.arrays import Bools, Floats, Indices
 from stages.fit.parts.base import Figures, Part, Step
-from stages.fit.settings import AutoFloat, PartSettings, Positive, Weight, automatic
+from stages.fit.settings import AutoFloat, PartSettings, Weight, automatic
 
 if TYPE_CHECKING:
     from stages.fit.trainer import Trainer
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
 TURNS = 4
 #: a scene lets through this much where it is said to show nothing
 CLEAR = 0.99
+#: Gaussians that each is compared with, and the difference of colour below which squares count
+NEIGHBOURS, TOLERANCE = 24, 0.02
 
 
 class Depth(Part, switch="lambda_depth", off=0.0):
@@ -133,15 +134,10 @@ class Variation(
         lambda_tv: AutoFloat = automatic({3: 0.0}, held=0.2)
         """weight of the mean difference between the colours of neighbouring Gaussians: albedos with
         a light beside the lens, else harmonics"""
-        tv_neighbours: Annotated[int, Field(ge=1, le=64)] = 24
-        """Gaussians that each is compared with"""
-        tv_tolerance: Positive = 0.02
-        """differences of colour below this count by their squares only"""
 
     def __init__(self, fit: Trainer) -> None:
-        s = fit.settings
         self.graph = numerics.total_variation.TotalVariation(
-            TURNS * s.lambda_tv, s.tv_neighbours, s.tv_tolerance
+            TURNS * fit.settings.lambda_tv, NEIGHBOURS, TOLERANCE
         )
 
     def guide(self, fit: Trainer, step: Step) -> None:

@@ -29,7 +29,7 @@ from pipeline.geometry.order import viewing_order
 from stages.fit.arrays import Array, Floats
 from stages.fit.parts.base import Part, interpolate
 from stages.fit.parts.camera import PoseOptimizer
-from stages.fit.settings import Count, PartSettings, Positive
+from stages.fit.settings import Count, PartSettings
 
 if TYPE_CHECKING:
     from pipeline.artifacts.cameras import Camera
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: where Gaussians let more light through than this, they don't show what a frame sees
 UNCOVERED = 0.5
+#: learning rates of the pose at the first and the last of the steps that place a view
+POSE_RATES = 3e-3, 3e-5
 
 
 class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed", "latest")):
@@ -58,10 +60,6 @@ class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed"
         """progressive: iterations per view until the next one is placed"""
         progressive_pose_iterations: Count = 300
         """progressive: steps that place a view, with the Gaussians frozen"""
-        progressive_pose_lr_init: Positive = 3e-3
-        """progressive: learning rate of the pose at the first of these steps"""
-        progressive_pose_lr_final: Positive = 3e-5
-        """progressive: and at the last one"""
 
     def __init__(self, fit: Trainer) -> None:
         """From here on the fit knows of the first frame only.
@@ -109,7 +107,7 @@ class Progressive(Part, switch="progressive", on=True, off=False, kept=("placed"
         fit.poses.poses[view] = next_pose(fit.poses.poses[self.order[: self.placed]])
         for step in range(s.progressive_pose_iterations):
             done = step / s.progressive_pose_iterations
-            rate = interpolate(s.progressive_pose_lr_init, s.progressive_pose_lr_final, done)
+            rate = interpolate(*POSE_RATES, done)
             self._find_pose(fit, view, rate)
         self._grow(fit, view)
         self.placed += 1

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from pipeline.artifacts.confidence import MEASURED
 from stages.fit.parts.base import Part
-from stages.fit.settings import AutoFloat, Count, PartSettings, Positive, Share, automatic
+from stages.fit.settings import AutoFloat, Count, PartSettings, Positive, automatic
 
 if TYPE_CHECKING:
     from stages.fit.config import FitSettings
@@ -21,9 +21,6 @@ class Filling(Part, absent={"trusted_confidence": 1.0, "fill_share": 1.0}):
         trusted_confidence: AutoFloat = automatic({3: MEASURED}, held=1.0, ge=1)
         """input points of less (raw) confidence were filled in: they are no depth prior, and are
         left out where they stand before others"""
-        fill_tolerance: Share = 0.03
-        """how far behind measured points a filled one may be, as a share of the depth, to be taken
-        for the same surface (and left out)"""
         fill_share: AutoFloat = automatic({3: 0.03, 6: 0.0}, le=1)
         """largest share of the Gaussians that starts from points filled in: between many views,
         what was not measured grows better from what was"""

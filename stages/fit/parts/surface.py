@@ -47,6 +47,8 @@ WIDTH = 2.0
 CLEAR = 2.0
 #: what ``warp_slope: auto`` comes to, with a light beside the lens and without
 SLOPE_LIT, SLOPE = 2.0, 0.3
+#: pixels, the least spacing of splines: what is finer no photograph can tell
+FINEST = 5.0
 
 
 class Surface(
@@ -71,8 +73,6 @@ class Surface(
         """thickness of held Gaussians, relative to their width"""
         hold_growth: Annotated[float, Field(ge=1)] = 2.0
         """by which factor Gaussians of a held scene may get wider than they start"""
-        hold_colors_until: Share = 0.0
-        """up to this share of the iterations, held Gaussians change colour only"""
 
     def __init__(self, fit: Trainer) -> None:
         super().__init__(fit)
@@ -88,14 +88,6 @@ class Surface(
         columns = [packed[:, :3], cloud.normals, packed[:, 9:10], firmness[:, None], widest]
         self.anchor: Floats = np.concatenate(columns, 1).astype(np.float32)
         self.turn: Floats = packed[:, 3:7].copy()
-
-    def still(self, done: float) -> bool:
-        """Whether Gaussians change colour only."""
-        return done < self.settings.hold_colors_until
-
-    def pace(self, step: Step) -> None:
-        if self.still(step.done):
-            step.rates[:11] = 0
 
     def follow(self, fit: Trainer, step: Step) -> None:
         numerics.surface.pull(fit.packed, self.anchor, self.turn)
@@ -186,9 +178,8 @@ class Warp(
         """bend the surface of the points as a whole by splines of so many widths, each twice the
         one before; 0: Gaussians only move on their own"""
         warp_spacing: Positive = 0.01
-        """spacing of the finest of these splines, as a share of the scene's depth"""
-        warp_spacing_px: Positive = 5.0
-        """and no less than so many pixels: what is finer no photograph can tell"""
+        """spacing of the finest of these splines, as a share of the scene's depth; never less than
+        five pixels"""
         warp_slope: AutoFloat = automatic(
             f"{SLOPE_LIT} with a light beside the lens; {SLOPE} without, where highlights "
             "that move would tear the surface",
@@ -207,15 +198,13 @@ class Warp(
         self.rates = s.warp_lr_init, s.warp_lr_final
         pixel = 1 / max(camera.fx for camera in scene.cameras)
         self.bend = numerics.surface.Warp(
-            cloud.positions, cloud.normals, max(s.warp_spacing, s.warp_spacing_px * pixel),
+            cloud.positions, cloud.normals, max(s.warp_spacing, FINEST * pixel),
             s.warp_levels, steepest(s, fit.lit), len(scene.views),
         )  # fmt: skip
 
     def guide(self, fit: Trainer, step: Step) -> None:
         """Let the surface as a whole follow the gradients of the Gaussians on it."""
         light, surface, bend = fit.find(Light), fit.find(Surface), self.bend
-        if surface is not None and surface.still(step.done):
-            return
         by_normal = None if light is None else light.by_normal
         bend.collect(step.gradients.packed[:, :3], by_normal)
         before = bend.facing
