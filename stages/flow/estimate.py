@@ -14,14 +14,9 @@ Array = npt.NDArray[np.float32]
 Gray = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 Method = Literal["dis", "farneback"]
-Preset = Literal["ultrafast", "fast", "medium"]
 
-_DIS_PRESETS = {
-    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-}
-
+#: Weight of the smoothness in DIS's variational refinement (OpenCV: 20).
+_SMOOTHNESS = 40.0
 #: Smallest image side that the pyramid of the flow methods works on.
 _SMALLEST_SIDE = 16
 
@@ -85,9 +80,6 @@ def estimate_flow(
     gray_j: Gray,
     start: Array,
     method: Method = "dis",
-    preset: Preset = "medium",
-    finest_scale: int = 0,
-    smoothness: float = 40.0,
 ) -> tuple[Array, Array]:
     """Estimate the flow from image i to image j, beginning with a guess.
 
@@ -99,9 +91,6 @@ def estimate_flow(
         gray_j: [H_j, W_j] uint8, of any size.
         start: [H_i, W_i, 2] guess in pixels (predicted from geometry, or `centred_start`).
         method: ``"dis"`` (Kroeger et al., ECCV 2016) or ``"farneback"`` (Farnebäck, SCIA 2003).
-        preset: effort of DIS.
-        finest_scale: pyramid level at which DIS stops; 0 is full size.
-        smoothness: weight of the smoothness in DIS's variational refinement.
 
     Returns:
         The flow [H_i, W_i, 2] and the residual r [H_i, W_i, 2], float32 pixels.
@@ -112,15 +101,12 @@ def estimate_flow(
     if shrink > 1.2:  # sampling a larger image sparsely would alias
         gray_j = np.asarray(cv2.GaussianBlur(gray_j, (0, 0), 0.5 * np.sqrt(shrink**2 - 1)))
     warped_j = np.asarray(sample(gray_j, grid + start), np.uint8)
-    residual = _residual(gray_i, warped_j, method, preset, finest_scale, smoothness)
+    residual = _residual(gray_i, warped_j, method)
     flow = residual + sample(start, grid + residual)
     return np.asarray(flow, np.float32), residual
 
 
-def _residual(
-    gray_i: Gray, warped_j: Gray, method: Method, preset: Preset, finest_scale: int,
-    smoothness: float,
-) -> Array:  # fmt: skip
+def _residual(gray_i: Gray, warped_j: Gray, method: Method) -> Array:
     """Flow between two images of the same size, padded where they are too small for a pyramid."""
     height, width = gray_i.shape
     down, right = max(0, _SMALLEST_SIDE - height), max(0, _SMALLEST_SIDE - width)
@@ -130,9 +116,9 @@ def _residual(
     ]
     empty = np.zeros((*images[0].shape, 2), np.float32)
     if method == "dis":
-        dis = cv2.DISOpticalFlow.create(_DIS_PRESETS[preset])
-        dis.setFinestScale(min(finest_scale, _levels(images[0].shape, dis.getPatchSize())))
-        dis.setVariationalRefinementAlpha(smoothness)
+        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        dis.setFinestScale(0)  # full resolution
+        dis.setVariationalRefinementAlpha(_SMOOTHNESS)
         flow = dis.calc(images[0], images[1], empty)
     else:
         flow = cv2.calcOpticalFlowFarneback(
@@ -140,12 +126,6 @@ def _residual(
             pyr_scale=0.5, levels=5, winsize=15, iterations=5, poly_n=7, poly_sigma=1.5, flags=0,
         )  # fmt: skip
     return np.ascontiguousarray(flow[:height, :width], np.float32)
-
-
-def _levels(shape: tuple[int, ...], patch: int) -> int:
-    """The coarsest level of DIS; asked to stop at a coarser one, it would choose a finer itself."""
-    by_motion = np.log(max(shape) / (4 * patch)) / np.log(2) + 0.5
-    return max(0, int(min(by_motion, np.log(min(shape) // patch) / np.log(2))))
 
 
 def consistency_mask(

@@ -16,6 +16,11 @@ from stages.flow import estimate, geometry
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
+#: Blur (sigma, pixels) of the flow that cameras and points predict.
+_PREDICTED_BLUR = 2.0
+#: Relative difference of depth that is still the same surface, and hides nothing.
+_SAME_SURFACE = 0.02
+
 
 @dataclass(frozen=True)
 class Side:
@@ -42,12 +47,8 @@ class Estimator:
     """How flow is estimated: see the fields of the same names in the stage's config."""
 
     method: estimate.Method = "dis"
-    preset: estimate.Preset = "medium"
-    finest_scale: int = 0
-    smoothness: float = 40.0
     normalization: float = 4.0
     prewarp: bool = True
-    smoothing: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,6 @@ class Trust:
     mask: Literal["consistency", "none"] = "consistency"
     consistency_relative: float = 0.0
     consistency_absolute: float = 0.25
-    depth_tolerance: float = 0.02
     min_texture: float = 2.0
     highlight_level: float = 1.0
 
@@ -98,7 +98,7 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
     flows, residuals = [], []
     for (a, b), prediction in zip(((i, j), (j, i)), predictions, strict=True):
         if prediction is not None and estimator.prewarp:
-            start = geometry.extend(prediction.flow, prediction.known, estimator.smoothing)
+            start = geometry.extend(prediction.flow, prediction.known, _PREDICTED_BLUR)
         else:
             start = estimate.centred_start(_size(a), _size(b))
         flow, residual = estimate.estimate_flow(
@@ -106,9 +106,6 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
             estimate.local_contrast(b.gray(), estimator.normalization),
             start,
             estimator.method,
-            estimator.preset,
-            estimator.finest_scale,
-            estimator.smoothness,
         )
         flows.append(flow)
         residuals.append(residual)
@@ -126,7 +123,7 @@ def flow_between(i: Side, j: Side, estimator: Estimator, trust: Trust) -> tuple[
         if prediction is not None and estimator.prewarp and trust.mask == "consistency":
             assert b.depth is not None
             mask &= prediction.known & ~geometry.occluded(
-                prediction.flow, prediction.depth_in_other, b.depth, trust.depth_tolerance
+                prediction.flow, prediction.depth_in_other, b.depth, _SAME_SURFACE
             )
         deviation = np.zeros(0, np.float32)
         if prediction is not None:

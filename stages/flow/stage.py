@@ -29,20 +29,6 @@ class FlowConfig(StageConfig):
     """Settings of the flow stage."""
 
     method: Literal["dis", "farneback"] = Field("dis", description="Optical flow algorithm.")
-    dis_preset: Literal["ultrafast", "fast", "medium"] = Field(
-        "medium", description="Effort of DIS: medium is the most accurate."
-    )
-    dis_finest_scale: int = Field(
-        0,
-        ge=0,
-        le=5,
-        description="Pyramid level at which DIS stops; 0 is full resolution. Small photographs "
-        "have fewer levels: it stops at the last one.",
-    )
-    dis_smoothness: float = Field(
-        40.0, ge=0, le=1000,
-        description="Weight of the smoothness in DIS's variational refinement (OpenCV: 20).",
-    )  # fmt: skip
     contrast_window: float = Field(
         4.0,
         ge=0,
@@ -54,9 +40,6 @@ class FlowConfig(StageConfig):
         "auto",
         description="Predict flow from cameras and points and estimate only what is left; auto: "
         "wherever there are cameras and points.",
-    )
-    prewarp_smoothing: float = Field(
-        2.0, ge=0, le=50, description="Blur (sigma, pixels) of the predicted flow."
     )
     window: int = Field(
         1, ge=1, le=10, description="Pair each view with this many next ones in viewing order."
@@ -80,10 +63,6 @@ class FlowConfig(StageConfig):
     consistency_absolute: float = Field(
         0.25, ge=0, le=100, description="Forward-backward test: tolerated squared error, pixels^2."
     )
-    depth_tolerance: float = Field(
-        0.02, gt=0, le=1,
-        description="Occlusion test: relative depth difference that is still the same surface.",
-    )  # fmt: skip
     min_texture: float = Field(
         2.0, ge=0, le=128,
         description="Trust flow only where the grey levels (0-255) of the 9x9 pixels around vary "
@@ -164,18 +143,10 @@ def _run(context: StageContext) -> None:
     shown = {view.name: view for pair in pairs for view in pair[:2]}
     sides = dict(zip(shown, in_threads(side, shown.values(), context.threads), strict=True))
 
-    estimator = Estimator(
-        method=config.method,
-        preset=config.dis_preset,
-        finest_scale=config.dis_finest_scale,
-        smoothness=config.dis_smoothness,
-        normalization=config.contrast_window,
-        prewarp=prewarp,
-        smoothing=config.prewarp_smoothing,
-    )
+    estimator = Estimator(config.method, config.contrast_window, prewarp)
     trust = Trust(
         config.mask, config.consistency_relative, config.consistency_absolute,
-        config.depth_tolerance, config.min_texture, config.highlight_level,
+        config.min_texture, config.highlight_level,
     )  # fmt: skip
     results: list[FlowPair] = []
     deviations, shares, poor = [], [], []
