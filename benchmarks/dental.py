@@ -36,7 +36,6 @@ from stages.init.dental.solution import PlacedView
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.teeth.choose import choose
-from stages.teeth.config import TeethConfig
 from stages.teeth.reader import read_photographs
 
 Array = npt.NDArray[np.float64]
@@ -146,7 +145,7 @@ def read_teeth(case: Case, threads: int) -> list[Dentition | None]:
     working = [working_view(view) for view in case.views]
     readings = read_photographs(working, threads, lambda *_: None)
     images = [view.image for view in working]
-    chosen = choose(readings, images, case.name.split(","), TeethConfig())
+    chosen = choose(readings, images, case.name.split(","))
     return [
         None if d.set_aside or not d.all_crowns else resized_dentition(d, (v.width, v.height))
         for d, v in zip(chosen, case.views, strict=True)

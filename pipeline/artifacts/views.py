@@ -207,6 +207,14 @@ def write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
     path.write_bytes(data.tobytes())
 
 
+def jpeg_bytes(pixels: npt.NDArray[np.uint8], quality: int) -> bytes:
+    """An RGB uint8 image [H, W, 3] as JPEG, without any metadata."""
+    ok, data = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {pixels.shape} as JPEG")
+    return bytes(data)
+
+
 def read_png(path: Path) -> npt.NDArray[np.uint8]:
     """Read a PNG as written by `write_png`: [H, W] or RGB [H, W, 3] uint8."""
     return decoded_png(path.read_bytes(), path)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.views import View, read_png, to_uint8
+from pipeline.artifacts.views import View, jpeg_bytes, read_png, to_uint8
 from pipeline.pages.remembered import remembered
 
 Image = npt.NDArray[np.uint8]
@@ -50,12 +50,13 @@ def picture(image: Image, alt: str, caption: str = "", long_side: int = LARGE) -
     """Pack an image [H, W, 3] uint8 (or grey [H, W]), scaled down to `long_side` if larger."""
     rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
     small = shrunk(rgb[..., :3], long_side)
-    ok, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not ok:
-        raise ValueError(f"cannot encode an image of shape {small.shape} as JPEG")
-    text = base64.b64encode(data.tobytes()).decode()
     height, width = small.shape[:2]
-    return Picture(f"data:image/jpeg;base64,{text}", width, height, alt, caption)
+    return Picture(jpeg_uri(small, QUALITY), width, height, alt, caption)
+
+
+def jpeg_uri(image: Image, quality: int) -> str:
+    """`data:` address of an RGB image [H, W, 3] as JPEG."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, quality)).decode("ascii")
 
 
 def shrunk(image: Image, long_side: int) -> Image:

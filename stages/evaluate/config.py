@@ -25,9 +25,6 @@ class EvaluateConfig(StageConfig):
     max_comparisons: int = Field(
         24, ge=1, le=1000, description="At most so many comparison pictures, spread over the views."
     )
-    error_range: float = Field(
-        0.25, gt=0, le=1, description="Error (0..1) that has the brightest colour in the pictures."
-    )
     save_renders: bool = Field(False, description="Also write render_<view>.png of every view.")
     ground_truth: GivenPath | None = runtime(
         None,
@@ -53,12 +50,6 @@ class EvaluateConfig(StageConfig):
         "in torch's cache. Without any, lpips is null.",
     )
     flip: bool = Field(True, description="Compute FLIP as well (0.2 s a picture).")
-    support_tolerance: float = Field(
-        0.02,
-        gt=0,
-        lt=1,
-        description="Relative difference of depth within which an input view saw the same surface.",
-    )
     support_pictures: bool = Field(
         True, description="Write support_<view>.png: tinted where no photograph saw the scene."
     )

@@ -22,6 +22,11 @@ from stages.splatting.support import SeenSurface, seen_surface
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
+#: Error (0..1) that has the brightest colour in the pictures.
+ERROR_RANGE = 0.25
+#: Relative difference of depth within which an input view saw the same surface.
+SAME_SURFACE = 0.02
+
 
 class Rendered(Protocol):
     """What a renderer returns: see `stages.splatting.rendering.RenderedView`."""
@@ -83,7 +88,7 @@ class Examiner:
                 camera, result, image, valid, surfaces, view.name if pictured else None
             )
         if self.config.comparisons and pictured:
-            picture = pictures.comparison(image, photo, self.config.error_range, view.mask)
+            picture = pictures.comparison(image, photo, ERROR_RANGE, view.mask)
             write_png(self.folder / f"{prefix}comparison_{view.name}.png", picture)
         if self.config.save_renders and saved:
             write_png(self.folder / f"{prefix}render_{view.name}.png", image)
@@ -105,9 +110,7 @@ class Examiner:
         surfaces: Sequence[SeenSurface], picture: str | None,
     ) -> float:  # fmt: skip
         rendered = (np.asarray(result.alpha) > COVERED) & valid
-        count = support_map(
-            camera, np.asarray(result.depth), rendered, surfaces, self.config.support_tolerance
-        )
+        count = support_map(camera, np.asarray(result.depth), rendered, surfaces, SAME_SURFACE)
         if self.config.support_pictures and picture is not None:
             write_png(self.folder / f"support_{picture}.png", overlay(image, count, rendered))
         return unsupported_share(count, rendered)

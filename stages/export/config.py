@@ -83,12 +83,10 @@ class ExportConfig(StageConfig):
     video_crf: int = Field(
         20, ge=1, le=51, description="x264 quality: smaller is better, and the file larger"
     )
-    video_sway: float = Field(2.0, ge=0, le=30, description="rise and fall on the way, in degrees")
     viewer: bool = Field(True, description="write viewer.html")
     viewer_photos: bool = Field(
         True, description="embed the photographs in the page, for thumbnails and comparison"
     )
-    viewer_photo_quality: int = Field(80, ge=10, le=100, description="their JPEG quality")
     viewer_sh_degree: int = Field(
         3, ge=0, le=3, description="highest spherical-harmonics degree that the page carries"
     )

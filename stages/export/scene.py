@@ -24,6 +24,8 @@ Pixels = npt.NDArray[np.uint8]
 
 #: So many Gaussians tell how far a scene reaches.
 _TO_FRAME = 5000
+#: Rise and fall of the video on its way, degrees.
+SWAY = 2.0
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,12 @@ class Scene:
         """[H, W, 3] uint8 as a camera sees the Gaussians, black behind."""
         return to_uint8(self.painter(camera).image)
 
-    def path(self, seconds: float, fps: int, sway_degrees: float) -> tuple[list[Camera], list[int]]:
+    def path(self, seconds: float, fps: int) -> tuple[list[Camera], list[int]]:
         """Places of the video, at the (even) size of the middle photograph, and each frame's."""
         middle = self.cameras[self.orbit.middle()]
         size = (even(middle.width), even(middle.height))
         count = max(1, round(seconds * fps))
-        sway = np.radians(sway_degrees)
-        places, frames = there_and_back(self.orbit, self.cameras, size, count, sway)
+        places, frames = there_and_back(self.orbit, self.cameras, size, count, np.radians(SWAY))
         return self._holding(places), frames
 
     def novel_camera(self, like: Camera) -> Camera:

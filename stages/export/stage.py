@@ -314,7 +314,7 @@ def _write_video(context: StageContext, scene: Scene, folder: Path) -> int:
     from stages.export.viewer.page import rasterizer_constants
 
     config: ExportConfig = context.config
-    places, place_of_frame = scene.path(config.video_seconds, config.video_fps, config.video_sway)
+    places, place_of_frame = scene.path(config.video_seconds, config.video_fps)
     last = {place: index for index, place in enumerate(place_of_frame)}
     near = rasterizer_constants(scene.gaussians, scene.cameras)["near"]
     size = (places[0].width, places[0].height)
@@ -340,7 +340,7 @@ def _write_page(context: StageContext, scene: Scene, folder: Path, knowledge: Kn
         scene.gaussians, scene.cameras, scene.orbit,
         scene.photos if config.viewer_photos else {},
         rasterizer_constants(scene.gaussians, scene.cameras),
-        config.viewer_sh_degree, config.viewer_photo_quality, knowledge,
+        config.viewer_sh_degree, knowledge,
     )  # fmt: skip
     return (folder / "viewer.html").write_bytes(page.encode())
 

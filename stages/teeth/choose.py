@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.corrections import SIDES, area, says_side, shows_less
-from stages.teeth.config import TeethConfig
-from stages.teeth.grey import chroma
+from stages.teeth.grey import has_colour
 from stages.teeth.read import Reading, row_extent
 
 Array32 = npt.NDArray[np.float32]
@@ -22,6 +21,16 @@ _OCCLUSAL = {
     "upper": "the biting surfaces of the upper jaw",
     "lower": "the biting surfaces of the lower jaw",
 }
+#: With fewer crowns a photograph shows no row of teeth.
+_LEAST_CROWNS = 5
+#: A row of teeth narrower than this, over the photograph's long side, is a face.
+_LEAST_EXTENT = 0.3
+#: With a lower median score of its crowns, each counting by its area, a photograph shows something
+#: else (clinics' photographs of teeth, braces too: .95 and more; of houses: .88 at most).
+_LEAST_SCORE = 0.9
+#: Two photographs whose crowns lie this near each other after a similarity transform, over the
+#: width of their rows, show the same.
+_SAME_VIEW = 0.02
 #: The jaws are apart if that is so probable by the whole picture; or so, where every fourth upper
 #: crown reaches down to a lower one: an open bite closes on the molars and shows a gap in front.
 #: (Sides of 12 generated ones: .77 at most. Of 45 photographs with the jaws apart the outlines of 8
@@ -36,9 +45,8 @@ _SHARPNESS_SIDE = 512
 
 
 def choose(
-    readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
-    config: TeethConfig,
-) -> list[Dentition]:  # fmt: skip
+    readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str]
+) -> list[Dentition]:
     """Set aside, with a reason each, the photographs that tell nothing of the closed bite.
 
     Args:
@@ -49,10 +57,8 @@ def choose(
     Returns:
         The dentitions, `set_aside` filled in.
     """
-    reasons = [
-        _unusable(reading, image, config) for reading, image in zip(readings, images, strict=True)
-    ]
-    for k, reason in _repeated(readings, images, names, reasons, config).items():
+    reasons = [_unusable(*each) for each in zip(readings, images, strict=True)]
+    for k, reason in _repeated(readings, images, names, reasons).items():
         reasons[k] = reason
     return [
         replace(reading.dentition, set_aside=reason)
@@ -60,24 +66,24 @@ def choose(
     ]
 
 
-def _unusable(reading: Reading, image: Array32, config: TeethConfig) -> str:
+def _unusable(reading: Reading, image: Array32) -> str:
     """Why a photograph by itself can't be used; empty: it can."""
     dentition = reading.dentition
-    if chroma(image) < config.least_colour:
+    if not has_colour(image):
         return "it has no colour, as others have: an X-ray, or not a photograph"
     count = len(dentition.all_crowns)
-    if count < config.least_crowns:
+    if count < _LEAST_CROWNS:
         return f"no row of teeth was found in it ({count} crown{'s' * (count != 1)})"
-    if usual_score(dentition) < config.least_score:
+    if usual_score(dentition) < _LEAST_SCORE:
         return "what was found in it hardly looks like teeth"
-    if row_extent(dentition) < config.least_extent:
+    if row_extent(dentition) < _LEAST_EXTENT:
         return "the teeth are too small in it: a face, or taken from too far away"
     occlusal = {kind: reading.kinds[kind] for kind in _OCCLUSAL}
     jaw = max(occlusal, key=lambda kind: occlusal[kind])
     rows = (len(dentition.upper), len(dentition.lower))
     if sum(occlusal.values()) > 0.5:
         return f"it shows {_OCCLUSAL[jaw]}"
-    if min(rows) <= 1 and max(rows) >= config.least_crowns and reading.kinds["other"] > 0.5:
+    if min(rows) <= 1 and max(rows) >= _LEAST_CROWNS and reading.kinds["other"] > 0.5:
         return "it shows one jaw only"
     if reading.apart > _least_apart(dentition) or dentition.jaws_apart > _APART_GAP:
         return "the jaws are apart in it"
@@ -104,7 +110,7 @@ def usual_score(dentition: Dentition) -> float:
 
 def _repeated(
     readings: Sequence[Reading], images: Sequence[Array32], names: Sequence[str],
-    reasons: Sequence[str], config: TeethConfig,
+    reasons: Sequence[str],
 ) -> dict[int, str]:  # fmt: skip
     """Photographs that show what a better one shows too -> why they are set aside."""
     usable = [k for k, reason in enumerate(reasons) if not reason]
@@ -119,7 +125,7 @@ def _repeated(
             if SIDES.get(says_side(names[k])) == says_side(names[other]) != "":
                 continue  # one is a mirror image, and of another side
             off = layout_distance(readings[k].dentition, readings[other].dentition)
-            if off is not None and off < config.same_view:
+            if off is not None and off < _SAME_VIEW:
                 result[k] = shows_less(names[other])
                 break
     return result

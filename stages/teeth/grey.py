@@ -18,11 +18,16 @@ TINT = np.array([
 ])  # fmt: skip
 
 
-def chroma(image: Array32) -> float:
-    """Mean distance of a picture's colours from grey (CIE ab)."""
+#: Mean distance of colours from grey (CIE ab) below which a picture has none: an X-ray, or, where
+#: all have none, a black-and-white photograph.
+_LEAST_COLOUR = 4.0
+
+
+def has_colour(image: Array32) -> bool:
+    """Whether a picture [H, W, 3] float32 sRGB has colour."""
     small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(np.clip(small, 0, 1), cv2.COLOR_RGB2Lab)
-    return float(np.linalg.norm(lab[..., 1:], axis=-1).mean())
+    return float(np.linalg.norm(lab[..., 1:], axis=-1).mean()) >= _LEAST_COLOUR
 
 
 def tinted(image: Array32) -> Array32:

@@ -39,7 +39,7 @@ class TeethStage(Stage):
         from stages.dentition.overlay import DOUBT_SHOWN, labelled_overlay
         from stages.dentition.working import resized_dentition, working_view
         from stages.teeth.choose import choose
-        from stages.teeth.grey import chroma, tinted
+        from stages.teeth.grey import has_colour, tinted
         from stages.teeth.reader import PhotographReader, evenly
 
         config: TeethConfig = context.config
@@ -52,7 +52,7 @@ class TeethStage(Stage):
             spare = {*evenly([k for k in every if k not in first], config.most_views)}
         asked = sorted({*first, *spare})
         working = [working_view(views[k]) for k in asked]
-        grey = all(chroma(view.image) < config.least_colour for view in working)
+        grey = not any(has_colour(view.image) for view in working)
         if grey:  # with others in colour, one that has none is an X-ray
             working = [replace(view, image=tinted(view.image)) for view in working]
         reader = PhotographReader(working, context.threads)
@@ -68,7 +68,7 @@ class TeethStage(Stage):
         names = [views[k].source_name or views[k].name for k in read]
         images = [working[place].image for place in places]
         chosen = (
-            choose(readings, images, names, config)
+            choose(readings, images, names)
             if config.set_aside
             else [reading.dentition for reading in readings]
         )

@@ -10,7 +10,6 @@ import pytest
 from pipeline.artifacts.teeth import Dentition
 from stages.dentition.crowns import dentition_of
 from stages.teeth.choose import choose, layout_distance
-from stages.teeth.config import TeethConfig
 from stages.teeth.read import Reading, numbered, row_extent
 from tests.stages.crowns_case import SIZE, mouth
 
@@ -50,7 +49,7 @@ def reasons(
 ) -> list[str]:
     pictures = images or [picture()] * len(readings)
     names = names or [f"p{k}.jpg" for k in range(len(readings))]
-    chosen = choose(readings, pictures, names, TeethConfig())
+    chosen = choose(readings, pictures, names)
     for before, after in zip(readings, chosen, strict=True):
         assert replace(after, set_aside="") == before.dentition
     return [view.set_aside for view in chosen]

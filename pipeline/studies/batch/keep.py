@@ -177,18 +177,17 @@ def write_thumbnail(workspace: Path, path: Path, contents: Collection[str], *, s
         return
     import cv2
 
-    from pipeline.artifacts.views import read_png
+    from pipeline.artifacts.views import jpeg_bytes, read_png
     from pipeline.pages.pictures import QUALITY, shrunk
 
     for candidate in candidates:
         with suppress(OSError, ValueError, cv2.error):
             image = shrunk(read_png(candidate)[..., :3], THUMBNAIL)
-            ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-            if ok:
-                temporary = temporary_beside(path)
-                temporary.write_bytes(data.tobytes())
-                temporary.replace(path)
-                return
+            jpeg = jpeg_bytes(image, QUALITY)
+            temporary = temporary_beside(path)
+            temporary.write_bytes(jpeg)
+            temporary.replace(path)
+            return
 
 
 def _photographs(workspace: Path, contents: Collection[str]) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -18,6 +16,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.gaussians import Gaussians, Light
 from pipeline.artifacts.space.scale import NO_SCALE
 from pipeline.geometry.world import scene_depth
+from pipeline.pages.pictures import jpeg_uri
 from stages.export.pictures.orbits import Orbit
 from stages.export.splats import PER_ROW, texels, visible
 from stages.export.viewer.compact import MOST_SEEN, Pack, add_gaussians, add_mesh
@@ -25,6 +24,8 @@ from stages.export.viewer.lighter import with_degree
 from stages.splatting.rendering import used_degree
 
 HERE = Path(__file__).parent
+#: Quality of the photographs in the page, as JPEG.
+PHOTO_QUALITY = 80
 #: What shows a scene and lets one turn it, on any page; and what the viewer adds.
 SCENE_SCRIPTS = (
     "camera.js", "decode.js", "sort.js", "renderer.js", "mesh.js", "screen.js", "steering.js",
@@ -68,14 +69,6 @@ class Knowledge:
     jaws: npt.NDArray[np.uint8] | None = None
     seen: npt.NDArray[np.uint8] | None = None
     mesh: tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.uint8]] | None = None
-
-
-def encode_jpeg(image: npt.NDArray[np.uint8], quality: int) -> str:
-    """`data:` address of an RGB image [H, W, 3] as JPEG without metadata."""
-    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not ok:
-        raise ValueError(f"cannot encode an image of shape {image.shape} as JPEG")
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
@@ -146,7 +139,6 @@ def build_page(
     photos: Mapping[str, npt.NDArray[np.uint8]],
     rasterizer: Mapping[str, float],
     sh_degree: int = 3,
-    jpeg_quality: int = 85,
     knowledge: Knowledge | None = None,
 ) -> str:
     """Build the viewer page.
@@ -159,7 +151,6 @@ def build_page(
         rasterizer: see `rasterizer_constants`, so that the page draws what the fit has seen.
         sh_degree: highest spherical-harmonics degree to carry; where that is less than the scene
             has, those are fitted to the colours that the cameras see.
-        jpeg_quality: of the photographs.
         knowledge: what else is known of the scene, for the tools of the page.
 
     Returns:
@@ -172,7 +163,7 @@ def build_page(
     for camera in cameras:
         view = describe_camera(camera)
         if camera.name in photos:
-            view["photo"] = encode_jpeg(photos[camera.name], jpeg_quality)
+            view["photo"] = jpeg_uri(photos[camera.name], PHOTO_QUALITY)
         views.append(view)
     scene = {
         "id": hashlib.sha256(gaussians.means.tobytes()).hexdigest()[:12],  # of links: where it lies
