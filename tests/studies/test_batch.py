@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -54,6 +55,26 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..
     get_stage.cache_clear()
 
 
+@pytest.fixture
+def here(run: Callable[..., Any]) -> Callable[..., Any]:
+    """As `run`, where cases need no process of their own: each takes a second to start."""
+    from pipeline.studies.batch import child, task
+
+    one = threading.Lock()  # at a time: a run has the whole process
+
+    def in_this_process(job: dict[str, Any], case: Any) -> tuple[int, str]:
+        with one:
+            child.run_case(job)
+        return 0, ""
+
+    def call(*cases: str, **options: Any) -> dict[str, Any]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(task, "_process", in_this_process)
+            return run(*cases, **options)
+
+    return call
+
+
 def add_case(folder: Path, name: str, *values: int) -> Path:
     case = folder / "cases" / name
     case.mkdir(parents=True)
@@ -76,12 +97,12 @@ def computed(folder: Path) -> Counter[str]:
     return Counter(json.loads(line)[0] for line in lines)
 
 
-def test_cases_are_run_once_and_seen_again(run: Any, tmp_path: Path) -> None:
+def test_cases_are_run_once_and_seen_again(here: Any, tmp_path: Path) -> None:
     add_case(tmp_path, "a", 1, 2)
     add_case(tmp_path, "clinic/b", 3, 4, 5)
     add_case(tmp_path, "clinic/like a", 1, 2)
     add_case(tmp_path, "empty")
-    found = run()
+    found = here()
     states = {name: record["state"] for name, record in found.items()}
     assert states == {
         "a": "done", "clinic/b": "done", "clinic/like a": "duplicate", "empty": "wrong",
@@ -101,19 +122,19 @@ def test_cases_are_run_once_and_seen_again(run: Any, tmp_path: Path) -> None:
     assert measured.pop("overjet_mm") == "-1.25"
     assert measured.pop("overjet_uncertainty_mm") == "0.5"
     assert set(measured.values()) == {""}
-    again = run()
+    again = here()
     assert computed(tmp_path) == {}
     assert again == found
     # A changed photograph and a changed setting are noticed; a file that was only touched is not.
     (tmp_path / "cases" / "a" / "1.jpg").write_text("7")
     os.utime(tmp_path / "cases" / "clinic" / "b" / "3.jpg", ns=(1, 1))
-    assert run()["clinic/like a"]["state"] == "done"  # not like `a` any more
+    assert here()["clinic/like a"]["state"] == "done"  # not like `a` any more
     assert computed(tmp_path) == {"views": 2, "fit": 2, "export": 2}
-    run(overrides=["fit.megabytes=1"])
+    here(overrides=["fit.megabytes=1"])
     assert computed(tmp_path) == {"fit": 3}  # what it exports has the same bytes
     # Pages and tables call a photograph by its name.
     (tmp_path / "cases" / "a" / "1.jpg").rename(tmp_path / "cases" / "a" / "9.jpg")
-    run(overrides=["fit.megabytes=1"])
+    here(overrides=["fit.megabytes=1"])
     assert computed(tmp_path)["views"] == 1
 
 
@@ -166,10 +187,12 @@ def test_the_summary_keeps_up_with_cases_that_end_quickly(
     assert told[-1].startswith("20 done;")
 
 
-def test_all_that_failed_is_tried_again_where_a_case_is_called_so(run: Any, tmp_path: Path) -> None:
+def test_all_that_failed_is_tried_again_where_a_case_is_called_so(
+    here: Any, tmp_path: Path
+) -> None:
     listed(tmp_path, failed="", none="fit.fail=refused")
-    run("cases.csv")
-    run("cases.csv", retry=["failed"])
+    here("cases.csv")
+    here("cases.csv", retry=["failed"])
     assert computed(tmp_path) == {"fit": 1}, "the store has what came of the good one"
 
 
@@ -186,7 +209,7 @@ def test_a_case_may_take_so_much_time_and_is_tried_again_when_asked(
 
 
 def test_a_file_that_a_setting_names_is_read_again_when_it_is_another(
-    run: Any, tmp_path: Path
+    here: Any, tmp_path: Path
 ) -> None:
     one, two = tmp_path / "one.txt", tmp_path / "two.txt"
     one.write_text("1")
@@ -196,53 +219,55 @@ def test_a_file_that_a_setting_names_is_read_again_when_it_is_another(
     for name in ("like", "other", "other_like"):
         text = text.replace(f"cases/{name},", "cases/a,")
     (tmp_path / "cases.csv").write_text(text)
-    states = {name: record["state"] for name, record in run("cases.csv").items()}
+    states = {name: record["state"] for name, record in here("cases.csv").items()}
     assert states == {"a": "done", "like": "duplicate", "other": "done", "other_like": "done"}
-    before = run("cases.csv")
+    before = here("cases.csv")
     assert computed(tmp_path) == {}
     two.write_text("1")
-    assert run("cases.csv")["other_like"]["state"] == "duplicate"
+    assert here("cases.csv")["other_like"]["state"] == "duplicate"
     one.write_text("3")
-    assert run("cases.csv")["other"]["files"] != before["other"]["files"]
+    assert here("cases.csv")["other"]["files"] != before["other"]["files"]
     assert computed(tmp_path) == {"fit": 2}
     one.rename(tmp_path / "moved.txt")
     (tmp_path / "cases.csv").write_text(text.replace("one.txt", "moved.txt"))
-    run("cases.csv")
+    here("cases.csv")
     assert computed(tmp_path) == {}, "what it says is the same"
-    found = run("cases.csv", overrides=[f"fit.file={two}"])
+    found = here("cases.csv", overrides=[f"fit.file={two}"])
     assert found["a"]["state"] == "done" and computed(tmp_path)["fit"] == 1
-    found = run("cases.csv", overrides=[f"fit.file={tmp_path / 'nowhere.txt'}"])
+    found = here("cases.csv", overrides=[f"fit.file={tmp_path / 'nowhere.txt'}"])
     assert found["a"]["state"] == "wrong" and found["other"]["state"] == "done"
 
 
-def test_what_a_person_put_right_is_taken_by_the_same_command(run: Any, tmp_path: Path) -> None:
+def test_what_a_person_put_right_is_taken_by_the_same_command(here: Any, tmp_path: Path) -> None:
     add_case(tmp_path, "a", 1, 2)
     add_case(tmp_path, "b", 1, 2)
     add_case(tmp_path, "c", 3, 4)
-    first = run()
+    first = here()
     said = tmp_path / "out" / "cases" / "a" / "teeth.yaml"
     for text in ("photographs: {}\n", "photographs:\n  1.jpg: {mirrored: true}\n"):
         said.write_text(text)
-        found = run()
+        found = here()
         assert computed(tmp_path)["fit"] == 1 and computed(tmp_path)["views"] == 0
         assert found["b"]["state"] == "duplicate" and found["c"] == first["c"]
-        assert run() == found and computed(tmp_path) == {}
+        assert here() == found and computed(tmp_path) == {}
     said.unlink()
-    assert run()["a"]["key"] == first["a"]["key"] != found["a"]["key"]
+    assert here()["a"]["key"] == first["a"]["key"] != found["a"]["key"]
     assert computed(tmp_path) == {}, "the store had it"
 
 
-def test_a_case_that_is_refused_now_shows_no_earlier_scene(run: Any, tmp_path: Path) -> None:
+def test_a_case_that_is_refused_now_shows_no_earlier_scene(
+    run: Any, here: Any, tmp_path: Path
+) -> None:
     case = add_case(tmp_path, "a", 1, 2)
     picture = tmp_path / "out" / "thumbnails" / "a.jpg"
-    assert {"viewer", "results"} <= set(run()["a"]["links"]) and picture.is_file()
+    assert {"viewer", "results"} <= set(here()["a"]["links"]) and picture.is_file()
     (tmp_path / "out" / "cases" / "a" / "report.html").write_text("of this run or an earlier one")
     (case / "1.jpg").write_text("7")
-    assert run(overrides=["fit.fail=refused"])["a"]["links"] == {"report": "report.html"}
+    assert here(overrides=["fit.fail=refused"])["a"]["links"] == {"report": "report.html"}
     assert not picture.exists()
     assert "results" not in (tmp_path / "out" / "summary.csv").read_text()
-    assert "viewer" in run()["a"]["links"] and picture.is_file()
-    assert run(overrides=["fit.file=nowhere"])["a"]["links"] == {}, "no page is written then"
+    assert "viewer" in here()["a"]["links"] and picture.is_file()
+    assert here(overrides=["fit.file=nowhere"])["a"]["links"] == {}, "no page is written then"
     assert run(overrides=["fit.fail=killed"])["a"]["links"] == {} and not picture.exists()
 
 
@@ -277,33 +302,33 @@ def test_without_a_limit_it_takes_the_memory_it_needs(
 
 
 def test_each_folder_of_cases_has_a_folder_of_results(
-    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    here: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for number, place in enumerate(("29.11.2025", "29.11.2026", "north/2024", "south/2024")):
         add_case(tmp_path, f"{place}/a", 10 * number, 10 * number + 1)
     for place in ("29.11.2025", "29.11.2026", "north/2024"):
-        run(f"cases/{place}", out=None)
+        here(f"cases/{place}", out=None)
     made = {path.name for path in (tmp_path / "runs").iterdir()}
     assert made == {"batch_29.11.2025", "batch_29.11.2026", "batch_2024"}
     with pytest.raises(RequestError, match=r"other cases, those of .*north/2024.*-o"):
-        run("cases/south/2024", out=None)
-    assert run("cases/north/2024", out=None)["a"]["state"] == "done" and computed(tmp_path) == {}
+        here("cases/south/2024", out=None)
+    assert here("cases/north/2024", out=None)["a"]["state"] == "done" and computed(tmp_path) == {}
     (tmp_path / "cases" / "north").rename(tmp_path / "cases" / "moved")
-    assert run("cases/moved/2024", out=None)["a"]["state"] == "done"
+    assert here("cases/moved/2024", out=None)["a"]["state"] == "done"
     assert computed(tmp_path) == {}, "it was known by what the photographs hold"
 
 
-def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:
+def test_only_results_are_kept(here: Any, tmp_path: Path) -> None:
     add_case(tmp_path, "a", 1, 2)
     place = tmp_path / "out" / "cases" / "a"
-    record = run()["a"]
+    record = here()["a"]
     assert (place / "results" / "splats.ply").is_file() and record["bytes"] > 9_000_000
     kept, gone = (
         f'<li><a href="results/{name}">{name}</a></li>' for name in ("viewer.html", "splats.ply")
     )
     (place / "report.html").write_text(f"<ul>{kept}{gone}</ul>")
-    record = run(keep="results")["a"]  # what was made before is trimmed, not made again
+    record = here(keep="results")["a"]  # what was made before is trimmed, not made again
     assert computed(tmp_path) == {}
     assert record["kept"] == "results" and record["bytes"] < 12_000_000
     assert set(record["left_out"]) == {"splats.ply", "colmap"}
@@ -312,11 +337,11 @@ def test_only_results_are_kept(run: Any, tmp_path: Path) -> None:
     said = (place / "results" / "README.txt").read_text()
     assert said.endswith("Left out by 'pipeline batch --keep results': colmap, splats.ply.\n")
     assert not (place / "fit").exists()
-    assert run(keep="results")["a"] == record and computed(tmp_path) == {}
-    assert run(keep="results", overrides=["fit.fail=refused"])["a"]["state"] == "refused"
+    assert here(keep="results")["a"] == record and computed(tmp_path) == {}
+    assert here(keep="results", overrides=["fit.fail=refused"])["a"]["state"] == "refused"
     assert (place / "results" / "viewer.html").read_text() == "<p>a scene", "nothing replaces it"
     (place / "results").rename(place / ".results.before")  # killed while it was run anew
-    run(retry=["a"])  # asked for anew, with all of it
+    here(retry=["a"])  # asked for anew, with all of it
     assert (place / "results" / "splats.ply").is_file() and computed(tmp_path)["fit"] == 1
     assert not (place / ".results.before").exists()
 

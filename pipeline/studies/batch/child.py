@@ -22,7 +22,6 @@ from pipeline.front.progress import LineReporter
 from pipeline.measure import peak_mb_with_children
 from pipeline.process.privacy import kept_for, private_from_now_on
 from pipeline.running.outcomes import RunSummary
-from pipeline.running.reporter import Reporter
 from pipeline.store import is_disk_full
 from pipeline.store.locks import lock_of
 from pipeline.store.places import is_there, remove, size_of
@@ -64,7 +63,7 @@ def main() -> None:
         raise
 
 
-def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str, Any]:
+def run_case(job: dict[str, Any]) -> dict[str, Any]:
     """Bring one case to its record, and return that.
 
     Another process that works on the same case is waited for; what it finds is taken.
@@ -91,7 +90,7 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
         remove(thumbnail)
         start = time.perf_counter()
         if trouble is None:
-            record |= _outcome(job, case, workspace, reporter or _reporter(job))
+            record |= _outcome(job, case, workspace)
         else:
             record |= {"state": "wrong", "reason": trouble}
         if record["state"] == "stopped":
@@ -109,11 +108,6 @@ def run_case(job: dict[str, Any], reporter: Reporter | None = None) -> dict[str,
         if record["kept"]:
             write_case(out, record)
     return record
-
-
-def _reporter(job: dict[str, Any]) -> Reporter:
-    """What writes the log of a case."""
-    return LineReporter(interval=5.0 if job["verbose"] else 20.0, verbose=job["verbose"])
 
 
 def _contents(job: dict[str, Any], case: Case, workspace: Path) -> tuple[list[str], str | None]:
@@ -145,10 +139,9 @@ def _links(workspace: Path, names: Iterable[str]) -> dict[str, str]:
     return {name: LINKS[name] for name in names if (workspace / LINKS[name]).exists()}
 
 
-def _outcome(
-    job: dict[str, Any], case: Case, workspace: Path, reporter: Reporter
-) -> dict[str, Any]:
-    """State, reason and figures of a run."""
+def _outcome(job: dict[str, Any], case: Case, workspace: Path) -> dict[str, Any]:
+    """State, reason and figures of a run, whose progress goes into the log."""
+    reporter = LineReporter(interval=5.0 if job["verbose"] else 20.0, verbose=job["verbose"])
     overrides = [*job["overrides"], *case.overrides, f"run.threads={job['threads']}"]
     try:
         with kept_aside(workspace):
