@@ -22,6 +22,7 @@ import pipeline
 from pipeline.artifacts import KINDS
 from pipeline.errors import RequestError
 from pipeline.stage import get_stage
+from pipeline.studies.benchmark import running, worker
 from tests.studies import toy_bench
 from tests.studies.small_batch import wait_for
 
@@ -36,13 +37,19 @@ SUITE: dict[str, Any] = {
 }
 
 
+in_its_own = running._Processes._status
+
+
 @contextmanager
-def toy_benchmark(folder: Path, charts: bool = False) -> Iterator[Callable[..., Any]]:
+def toy_benchmark(
+    folder: Path, charts: bool = False, here: bool = False
+) -> Iterator[Callable[..., Any]]:
     """What writes a suite with some changes, runs it, and returns its results.
 
     Args:
         folder: that everything is in.
         charts: whether the report is written.
+        here: cells are run in this process: one of their own takes a second to start.
     """
 
     def call(change: Callable[[dict[str, Any]], None] | None = None, **options: Any) -> Any:
@@ -55,6 +62,8 @@ def toy_benchmark(folder: Path, charts: bool = False) -> Iterator[Callable[..., 
         patch.setattr("pipeline.stage._entry_points", lambda: toy_bench.STAGES)
         patch.setattr("pipeline.studies.benchmark.running.WORKER", (*toy_bench.COMMAND, "worker"))
         patch.setenv("TOY_LOG", str(folder / "log.txt"))
+        if here:
+            patch.setattr(running._Processes, "_status", in_this_process)
         if not charts:
             patch.setattr(
                 "pipeline.studies.benchmark.running.benchmark_report", toy_bench.no_report
@@ -64,10 +73,19 @@ def toy_benchmark(folder: Path, charts: bool = False) -> Iterator[Callable[..., 
     get_stage.cache_clear()
 
 
+def in_this_process(processes: Any, job: dict[str, Any]) -> int | None:
+    """In place of `_Processes._status`, but for who is to be killed."""
+    if job["cell"]["method"] == "killed":
+        return in_its_own(processes, job)
+    with processes.lock:  # one at a time: a run has the whole process
+        worker.run_job(job)
+    return 0
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Callable[..., Any]]:
     make_case(tmp_path)
-    with toy_benchmark(tmp_path) as call:
+    with toy_benchmark(tmp_path, here=True) as call:
         yield call
 
 
@@ -84,7 +102,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
 def again(finished: tuple[Path, Any], tmp_path: Path) -> Iterator[Callable[..., Any]]:
     """As `bench`, in a copy of the finished one: it goes on from there."""
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
-    with toy_benchmark(tmp_path) as call:
+    with toy_benchmark(tmp_path, here=True) as call:
         yield call
 
 
@@ -201,7 +219,7 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
             for name, (how, _, _) in TROUBLES.items()
         ]
 
-    with toy_benchmark(folder) as call:
+    with toy_benchmark(folder, here=True) as call:
         results = call(change)
         told = (folder / "out" / "tables.md").read_text()
         call(change)

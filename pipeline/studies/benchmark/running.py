@@ -163,27 +163,10 @@ class _Processes:
         """Run one cell in a process; None if the benchmark is being stopped."""
         path = record_path(cell, out)
         remove(path)
-        with self.lock:
-            if self._stopped:
-                return None
-            process = subprocess.Popen(
-                WORKER, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-            )
-            self._running.add(process)
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            job = {
-                "cell": cell.to_dict(), "out": str(out), "share": share_for(out), **told,
-            }  # fmt: skip
-            process.stdin.write(json.dumps(job) + "\n")
-            process.stdin.flush()
-        status = process.wait()
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
-        with self.lock:
-            self._running.discard(process)
-            if self._stopped:
-                return None
+        job = {"cell": cell.to_dict(), "out": str(out), "share": share_for(out), **told}
+        status = self._status(job)
+        if status is None:
+            return None
         record = read_own(path)
         if record is not None:
             return record
@@ -195,6 +178,26 @@ class _Processes:
         )
         write_sealed(path, record)
         return record
+
+    def _status(self, job: dict[str, Any]) -> int | None:
+        """How the process of a job ended; None if the benchmark is being stopped."""
+        with self.lock:
+            if self._stopped:
+                return None
+            process = subprocess.Popen(
+                WORKER, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+            )
+            self._running.add(process)
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(json.dumps(job) + "\n")
+            process.stdin.flush()
+        status = process.wait()
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        with self.lock:
+            self._running.discard(process)
+            return None if self._stopped else status
 
     def stop(self) -> None:
         """End what runs. The store survives a kill at any moment."""

@@ -52,8 +52,13 @@ class CellReporter(LineReporter):
 def main() -> None:
     """Run the job that stands in the first line of standard input."""
     job = given_job()
-    cell, out = Cell.from_dict(job["cell"]), Path(job["out"])
     private_from_now_on()
+    run_job(job)
+
+
+def run_job(job: dict[str, Any]) -> None:
+    """Bring one cell to its record."""
+    cell, out = Cell.from_dict(job["cell"]), Path(job["out"])
     try:
         with kept_for(job["share"]):
             record = run_cell(cell, out, job["threads"], _reporter(cell, job))
