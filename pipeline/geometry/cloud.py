@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.pointmaps import PointmapPair
@@ -14,6 +15,8 @@ Array = npt.NDArray[np.float32]
 
 #: Of what was filled in, one pixel in so many (in x and y) becomes a point.
 FILL_STEP = 4
+#: So many points tell how far those of a cloud lie from each other.
+SPACED = 20_000
 
 
 def depth_points(
@@ -47,8 +50,6 @@ def sparse_points(
     Their confidence is 2: matched and triangulated, but not looked at by dense stereo. The scale
     is the distance to the nearest neighbours, as in 3D Gaussian Splatting.
     """
-    from scipy.spatial import cKDTree
-
     colors = np.zeros((len(positions), 3))
     normals = np.zeros((len(positions), 3))
     count = np.zeros(len(positions))
@@ -60,18 +61,34 @@ def sparse_points(
         count[inside] += 1
         towards = camera.centre - positions
         normals += towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    neighbours = min(4, len(positions))
-    distances = cKDTree(positions).query(positions, k=neighbours)[0].reshape(len(positions), -1)
     length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return Points(
         positions=positions.astype(np.float32),
         colors=(colors / np.maximum(count, 1)[:, None]).astype(np.float32),
         normals=(normals / length).astype(np.float32),
         confidence=np.full(len(positions), 2, np.float32),
-        scale=distances[:, 1:].mean(1).astype(np.float32)
-        if neighbours > 1
-        else np.zeros(len(positions), np.float32),
+        scale=neighbour_distances(positions),
     )
+
+
+def neighbour_distances(positions: npt.NDArray[np.float64]) -> Array:
+    """[P] float32 mean distance of points [P, 3] to the three nearest others, or what there are."""
+    neighbours = min(4, len(positions))
+    if neighbours < 2:
+        return np.zeros(len(positions), np.float32)
+    distances = cKDTree(positions).query(positions, k=neighbours)[0]
+    return np.asarray(distances[:, 1:].mean(1), np.float32)
+
+
+def median_spacing(positions: npt.NDArray[np.floating], threads: int = 1) -> float:
+    """Median distance to the nearest neighbour, of an even sample of points [N, 3]; 0 of one."""
+    if len(positions) < 2:
+        return 0.0
+    points = np.asarray(positions, np.float64)
+    some = points[:: max(1, len(points) // SPACED)]
+    # for few queries: what makes many fast takes longer than they do
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return float(np.median(tree.query(some, 2, workers=max(threads, 1))[0][:, 1]))
 
 
 def joined(clouds: list[Points]) -> Points:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.geometry.cloud import median_spacing
 from stages.sap.downsample import Cloud, voxel_downsample, voxel_size_for
-from stages.sap.spacing import median_spacing
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How far apart the points of a cloud lie: nearest-neighbour spacing and 3DGS's first scale."""
+"""How far apart the points of a cloud lie: 3DGS's first scale."""
 
 from __future__ import annotations
 
@@ -37,16 +37,3 @@ def point_scales(positions: npt.NDArray[np.floating], threads: int = 1) -> Array
     apart = squared[squared > 0]
     least = MIN_SQUARED_DISTANCE * (np.median(apart) if len(apart) else 1)
     return np.sqrt(np.maximum(squared, least)).astype(np.float32)
-
-
-def median_spacing(
-    positions: npt.NDArray[np.floating], threads: int = 1, sample: int = 20_000
-) -> float:
-    """Median distance to the nearest neighbour, of an even sample of at most `sample` points."""
-    count = len(positions)
-    if count < 2:
-        return 0.0
-    points = np.asarray(positions, np.float64)
-    chosen = points[:: max(1, count // sample)]
-    distance, _ = cKDTree(points).query(chosen, k=2, workers=max(threads, 1))
-    return float(np.median(distance[:, 1]))

@@ -10,11 +10,12 @@ from pydantic import ValidationError
 
 from pipeline.artifacts.points import Points
 from pipeline.errors import ReconstructionError
+from pipeline.geometry.cloud import median_spacing
 from pipeline.stage import LocalContext
 from stages.sap.budget import reduce_cloud
 from stages.sap.downsample import Cloud, voxel_downsample, voxel_size_for
 from stages.sap.prune import oversized, survivors
-from stages.sap.spacing import median_spacing, point_scales
+from stages.sap.spacing import point_scales
 from stages.sap.stage import SapConfig, SapStage
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.errors import RequestError
+from pipeline.geometry.cloud import neighbour_distances
 from pipeline.untrusted.files import UnusableFile
 from pipeline.untrusted.scenes.colmap import read_cloud, read_model
 
@@ -108,14 +108,10 @@ def as_points(
             length = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
             normals[indices] += towards / length
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    neighbours = min(4, len(positions))
-    scale = np.zeros(len(positions))
-    if neighbours > 1:
-        scale = cKDTree(positions).query(positions, k=neighbours)[0][:, 1:].mean(1)
     return Points(
         positions=positions.astype(np.float32),
         colors=np.asarray(colors, np.float32),
         normals=normals.astype(np.float32),
         confidence=np.maximum(count, 1).astype(np.float32),
-        scale=scale.astype(np.float32),
+        scale=neighbour_distances(positions),
     )

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.points import Points
 from pipeline.artifacts.views import to_uint8
+from pipeline.geometry.cloud import median_spacing
 from stages.export.mesh.bend import bent
 from stages.export.mesh.field import TRUNCATION, colors_of, fuse
 from stages.export.mesh.nets import zero_surface
@@ -24,7 +25,6 @@ from stages.export.mesh.surface import (
     keep_vertices,
     poisson,
     repair,
-    spacing,
     trusted_depth,
 )
 
@@ -84,7 +84,7 @@ def raw_surface(
     trusted = bent(
         start, scene.cameras, [_trusted(scene, k, np.inf) for k in range(len(scene.seen))]
     )
-    reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * spacing(trusted.positions))
+    reach = max(SUPPORT_VOXELS * voxel, SUPPORT_REACH * median_spacing(trusted.positions))
     if method == "tsdf":
         surface = fused(scene, trusted, voxel, cell, between_views, reach_behind, reach, progress)
     else:

@@ -91,13 +91,6 @@ def keep_near(mesh: Mesh, support: npt.NDArray[np.floating], reach: float) -> Me
     return keep_vertices(mesh, distance <= reach)
 
 
-def spacing(points: npt.NDArray[np.floating]) -> float:
-    """Median distance of points [N, 3], N >= 2, to their nearest neighbours."""
-    cloud = np.asarray(points, np.float64)
-    distance, _ = few_queries(cloud).query(cloud[:: max(1, len(cloud) // 20_000)], 2)
-    return float(np.median(distance[:, 1]))
-
-
 def few_queries(points: npt.NDArray[np.floating]) -> cKDTree:
     """For a few queries: what makes many fast takes longer than they do."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
