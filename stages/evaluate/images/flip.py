@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stages.evaluate.images.rows import by_rows
+from stages.photographs.srgb import linear
 
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
@@ -49,10 +50,7 @@ _WHITE = _XYZ_FROM_RGB.sum(1)
 _OPPONENT = np.array([[0, 116, 0], [500, -500, 0], [0, 200, -200]]) / _WHITE
 _OPPONENT_FROM_RGB = _OPPONENT @ _XYZ_FROM_RGB
 _RGB_FROM_OPPONENT = np.linalg.inv(_OPPONENT_FROM_RGB)
-_LINEAR = np.arange(256) / 255
-_LINEAR = np.where(_LINEAR > 0.04045, ((_LINEAR + 0.055) / 1.055) ** 2.4, _LINEAR / 12.92).astype(
-    np.float32
-)
+_LINEAR = linear(np.arange(256) / 255).astype(np.float32)
 
 
 def flip_map(image: Image, truth: Image) -> Floats:

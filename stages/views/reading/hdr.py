@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from stages.photographs.srgb import encoded
+
 Floats = npt.NDArray[np.float32]
 
 #: FFmpeg's numbers of the curves.
@@ -46,17 +48,13 @@ def srgb_from_hdr(rgb: npt.NDArray[np.uint16], curve: int) -> npt.NDArray[np.uin
         light = np.maximum(light @ _BT709_FROM_BT2020.T, 0)
         most = np.maximum(light.max(-1, keepdims=True), np.float32(1e-6))
         light *= _pressed(most) / most
-        made[top : top + step] = np.round(255 * _srgb(light))
+        made[top : top + step] = np.round(255 * encoded(light))
     return made
 
 
 def _pressed(light: Floats) -> Floats:
     over = np.maximum(light - SHOULDER, 0) / (1 - SHOULDER)
     return np.minimum(light, SHOULDER) + (1 - SHOULDER) * over / (1 + over)
-
-
-def _srgb(light: Floats) -> Floats:
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def _pq(signal: Floats) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
+from stages.photographs.srgb import linear
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -77,7 +78,7 @@ def tissue_colours(image: Image, dentition: Dentition) -> Tissue | None:
     gum = (away > GUM_NEAR) & (away < GUM_FAR)
     if min(enamel.sum(), gum.sum()) < 50:
         return None
-    logs = [np.log(np.maximum(_linear(np.median(rgb[where], axis=0)), DARK))
+    logs = [np.log(np.maximum(linear(np.median(rgb[where], axis=0)), DARK))
             for where in (enamel, gum)]  # fmt: skip
     red, green, blue = logs[1] - logs[0]
     return Tissue(
@@ -102,10 +103,6 @@ def colour_distances(images: list[Image], dentitions: list[Dentition]) -> list[C
             )
         )
     return result
-
-
-def _linear(srgb: Array) -> Array:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _distance(a: Array, b: Array) -> float:
