@@ -286,7 +286,7 @@ def flat_cloud(
 @remembered
 def line_chart(
     x: Sequence[float], lines: Mapping[str, Sequence[float]], labels: tuple[str, str],
-    alt: str, caption: str = "", *, log: bool = False,
+    alt: str, *, log: bool = False,
 ) -> Chart:  # fmt: skip
     """One or several curves over the same x.
 
@@ -306,7 +306,7 @@ def line_chart(
         if len(lines) > 1:
             axes.legend()
 
-    return draw(paint, alt, caption)
+    return draw(paint, alt)
 
 
 def _log_if_wide(axes: Axes, values: Sequence[float]) -> None:

@@ -87,7 +87,7 @@ def figure_cell(name: str, value: Any) -> Cell:
     return Cell(number(float(value) * shown.factor, shown.digits), float(value))
 
 
-def views_table(scores: Scores, labels: Mapping[str, str], caption: str = "") -> Table:
+def views_table(scores: Scores, labels: Mapping[str, str]) -> Table:
     """The figures of each view, with their mean.
 
     Args:
@@ -109,7 +109,7 @@ def views_table(scores: Scores, labels: Mapping[str, str], caption: str = "") ->
     mean = scores.mean
     sums = [[Cell("mean"), *(figure_cell(name, mean.get(name)) for name in names)]] if mean else []
     head = ["view", *(FIGURES.get(name, Figure(name, 3)).title for name in names)]
-    return Table(head, rows, sums, caption, sortable=True)
+    return Table(head, rows, sums, sortable=True)
 
 
 #: Readable names of pose figures; others are shown as they are.
@@ -129,7 +129,7 @@ POSES = {
 }
 
 
-def block_table(block: Mapping[str, Any], titles: Mapping[str, str], caption: str) -> Table:
+def block_table(block: Mapping[str, Any], titles: Mapping[str, str]) -> Table:
     """Nested figures ({"rotation_deg": {"median": 0.1}}) as a table of two columns."""
     rows: list[list[Cell]] = []
     for name in [*(n for n in titles if n in block), *sorted(set(block) - set(titles))]:
@@ -142,7 +142,7 @@ def block_table(block: Mapping[str, Any], titles: Mapping[str, str], caption: st
             ]  # fmt: skip
         elif isinstance(value, int | float | str):
             rows.append([Cell(title), cell(value, 3)])
-    return Table(("figure", "value"), rows, caption=caption)
+    return Table(("figure", "value"), rows)
 
 
 @dataclass(frozen=True)

@@ -259,7 +259,7 @@ def figures(case: Case) -> Iterator[Part]:
     poses, geometry = metrics.part("poses"), metrics.part("geometry")
     for what, group, titles in (("Cameras", poses, POSES), ("Geometry", geometry, {})):
         if group:
-            blocks += [Heading(f"{what} against the ground truth"), block_table(group, titles, "")]
+            blocks += [Heading(f"{what} against the ground truth"), block_table(group, titles)]
     if blocks:
         note = f"per view{', poses' if poses else ''}{', geometry' if geometry else ''}"
         yield Section("Figures", blocks, note)

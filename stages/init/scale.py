@@ -15,7 +15,7 @@ from pipeline.errors import RequestError, nearest
 Array = npt.NDArray[np.float64]
 
 
-def photo_named(views: Views, name: str, setting: str = "init.length.photo") -> View:
+def photo_named(views: Views, name: str) -> View:
     """The photograph that the user means.
 
     Raises:
@@ -24,7 +24,9 @@ def photo_named(views: Views, name: str, setting: str = "init.length.photo") -> 
     names = {view.source_name: view for view in views.views}
     names |= {Path(view.source_name).stem: view for view in views.views} | views.by_name() | names
     if name not in names:
-        raise RequestError(f"{setting}: there is no photograph '{name}'.{nearest(name, names)}")
+        raise RequestError(
+            f"init.length.photo: there is no photograph '{name}'.{nearest(name, names)}"
+        )
     return names[name]
 
 

@@ -296,7 +296,7 @@ def lens_of(view: View, text: str) -> KnownCamera:
     return KnownCamera(view.name, lens, np.eye(4))
 
 
-def bending(view: View, known: KnownCamera, setting: str = SETTING) -> float:
+def bending(view: View, known: KnownCamera, setting: str) -> float:
     """By how many pixels at most the distortion of a lens moves what its view shows."""
     straight = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), -1)
     bent = _distorted(view, known, pinhole_camera(view, known, setting), setting)

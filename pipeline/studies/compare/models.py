@@ -56,13 +56,13 @@ def _is_model(folder: Path) -> bool:
     )
 
 
-def read_largest(path: Path, views: Sequence[View], setting: str = "--colmap") -> Model:
+def read_largest(path: Path, views: Sequence[View]) -> Model:
     """Read the model with most registered images, then most points, of those in a folder.
 
     Raises:
         RequestError: there is none, it is damaged, or fewer than two views have a camera in it.
     """
-    folders = model_folders(path)
+    setting, folders = "--colmap", model_folders(path)
     if not folders:
         raise RequestError(
             f"{setting}: {path} holds no COLMAP model. Give the folder with cameras, images and "
