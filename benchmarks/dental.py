@@ -36,7 +36,7 @@ from stages.init.dental.solution import PlacedView
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.teeth.choose import choose
-from stages.teeth.reader import read_photographs
+from stages.teeth.reader import PhotographReader
 
 Array = npt.NDArray[np.float64]
 
@@ -143,7 +143,7 @@ def read_case(data: Path, names: str, long_side: int = SIZE[0]) -> Case:
 def read_teeth(case: Case, threads: int) -> list[Dentition | None]:
     """The crowns of each photograph as the stage `teeth` reads them; None: it is set aside."""
     working = [working_view(view) for view in case.views]
-    readings = read_photographs(working, threads, lambda *_: None)
+    readings = PhotographReader(working, threads).read(lambda *_: None)
     images = [view.image for view in working]
     chosen = choose(readings, images, case.name.split(","))
     return [

@@ -145,11 +145,6 @@ class PhotographReader:
             yield map_
 
 
-def read_photographs(views: Sequence[View], threads: int, progress: Progress) -> list[Reading]:
-    """Read every photograph (`PhotographReader.read`)."""
-    return PhotographReader(views, threads).read(progress)
-
-
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
     """At most so many of some items, evenly chosen."""
     if not items:

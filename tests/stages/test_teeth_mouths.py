@@ -21,7 +21,7 @@ from stages.init.dental.reconstruct import with_numbers
 from stages.init.dental.solution import ArchFit
 from stages.init.stage import InitStage
 from stages.teeth.read import Reading
-from stages.teeth.reader import read_photographs
+from stages.teeth.reader import PhotographReader
 from tests.stages.mouth_case import (
     Case,
     mouth_case,
@@ -130,7 +130,7 @@ def test_primary_teeth_among_permanent_ones_are_told(seed: int) -> None:
 
 @pytest.fixture(scope="module")
 def upright() -> list[Reading]:
-    return read_photographs(case("normal").views.views, 1, lambda *_: None)
+    return PhotographReader(case("normal").views.views, 1).read(lambda *_: None)
 
 
 @pytest.mark.parametrize("quarters", [(2, 2, 2), (0, 1, 3), (0, 2, 0)])
@@ -142,7 +142,7 @@ def test_photographs_are_read_whichever_way_up_they_are(
         replace(view, image=np.ascontiguousarray(np.rot90(view.image, k)))
         for view, k in zip(case("normal").views.views, quarters, strict=True)
     ]
-    found = read_photographs(turned, 1, lambda *_: None)
+    found = PhotographReader(turned, 1).read(lambda *_: None)
     for one, other, k in zip(upright, found, quarters, strict=True):
         more = (other.dentition.roll - one.dentition.roll + k * np.pi / 2) / (2 * np.pi)
         assert abs(more - round(more)) < 0.02
