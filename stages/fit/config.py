@@ -11,7 +11,7 @@ from pipeline.stage import runtime
 from stages.fit.parts.base import Part
 from stages.fit.parts.camera import Background, Exposure, Focal, Poses
 from stages.fit.parts.colours import Colours
-from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic
+from stages.fit.parts.density import SETTLE, Density, Floaters, Isotropic, Mcmc
 from stages.fit.parts.detail import Detail
 from stages.fit.parts.extension import MORE, Extension
 from stages.fit.parts.harmonics import Harmonics, Photometry
@@ -37,12 +37,12 @@ from stages.fit.settings import (
 #: the parts of the fit, in the order in which gradients pass them: from the camera to the scene
 PARTS: tuple[type[Part], ...] = (
     Progressive, Filling, Shading, Saturation, Coarse, Extension, Harmonics, Photometry, Detail,
-    Exposure, Background, Depth, Flow, Silhouette, Light, Isotropic, Variation, Warp, Surface,
+    Exposure, Background, Depth, Flow, Silhouette, Light, Isotropic, Variation, Warp, Mcmc, Surface,
     Lining, Poses, Focal, Density, Floaters, Colours,
 )  # fmt: skip
 PartName = Literal[
     "background", "coarse", "colours", "density", "depth", "detail", "exposure", "extension",
-    "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "lining",
+    "filling", "floaters", "flow", "focal", "harmonics", "isotropic", "light", "lining", "mcmc",
     "photometry", "poses", "progressive", "saturation", "shading", "silhouette", "surface",
     "variation", "warp",
 ]  # fmt: skip
@@ -100,7 +100,7 @@ class Basics(PartSettings):
 
 
 class FitConfig(
-    Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings,
+    Colours.Settings, Floaters.Settings, Background.Settings, Exposure.Settings, Mcmc.Settings,
     Density.Settings, Detail.Settings, Photometry.Settings, Harmonics.Settings, Warp.Settings,
     Surface.Settings, Lining.Settings, Isotropic.Settings, Focal.Settings, Progressive.Settings,
     Poses.Settings, Extension.Settings, Coarse.Settings, Variation.Settings, Depth.Settings,
@@ -140,9 +140,10 @@ class FitConfig(
     @model_validator(mode="after")
     def _check(self) -> FitConfig:
         plain = self.light == "none" and self.hold_surface is False and self.lambda_flow == 0
-        if self.progressive and not plain:
+        if self.progressive and not (plain and self.strategy == "default"):
             raise ValueError(
-                "progressive works with light none, hold_surface false and lambda_flow 0 only"
+                "progressive works with light none, hold_surface false, lambda_flow 0 and "
+                "strategy default only"
             )
         if self.isotropic and (self.hold_surface is not False or self.detail):
             raise ValueError(

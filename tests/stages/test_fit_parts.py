@@ -20,7 +20,7 @@ from stages.fit.inputs.initial import (
 )
 from stages.fit.inputs.scene import out_of_place, prepare, trusted_points
 from stages.fit.inputs.targets import Target, make_target
-from stages.fit.numerics.density import rotations
+from stages.fit.numerics.density import add_noise, add_regularisers, relocate, rotations, shared
 from stages.fit.parts.camera import Background, Focal, SharedFocal
 from stages.fit.parts.surface import Surface, worth_holding
 from stages.splatting.harmonics import harmonics
@@ -36,6 +36,59 @@ def packed_scene(count: int, seed: int = 0) -> np.ndarray:
     packed[:, 7:10] = np.log(rng.uniform(0.01, 0.1, (count, 3)))
     packed[:, 10] = rng.normal(size=count)
     return packed
+
+
+def test_shared_gaussians_stop_as_much_light_as_the_one_did() -> None:
+    opacity = np.array([0.9, 0.5, 0.05, 0.7])
+    sharers = np.array([2, 5, 3, 1])
+    share, factor = shared(opacity, sharers)
+    assert 1 - (1 - share.astype(float)) ** sharers == pytest.approx(opacity, abs=1e-5)
+    assert factor[3] == pytest.approx(1)
+    # two of opacity a at scale f integrate to 2 a f - a^2 f / sqrt(2), as one of opacity 0.9 does
+    a = float(share[0])
+    assert float(factor[0]) * (2 * a - a**2 / np.sqrt(2)) == pytest.approx(0.9, abs=1e-5)
+
+
+def test_relocation_moves_the_dead_and_keeps_to_the_cap() -> None:
+    packed = packed_scene(400)
+    packed[:40, 10] = -9  # dead
+    random = np.random.default_rng(1)
+    moved, source, fresh = relocate(packed, 0.005, 410, random)
+    assert len(moved) == 410 == len(source) == len(fresh)
+    assert not np.isin(source, np.arange(40)).any()
+    assert (1 / (1 + np.exp(-moved[:, 10])) >= 0.0049).all()
+    same = ~fresh
+    assert np.array_equal(moved[same], packed[source[same]])
+    counts = np.bincount(source, minlength=400)
+    assert (counts[source[fresh]] > 1).all() and fresh.sum() > 50
+    again = relocate(packed, 0.005, 410, np.random.default_rng(1))
+    assert np.array_equal(again[0], moved)
+
+
+def test_noise_moves_the_transparent_only() -> None:
+    packed = packed_scene(200)
+    packed[:100, 10] = 4
+    packed[100:, 10] = -9
+    before = packed.copy()
+    add_noise(packed, 10.0, np.random.default_rng(0))
+    step = np.abs(packed - before).max(1)
+    assert step[:100].max() < 1e-6 < step[100:].min()
+    assert np.array_equal(packed[:, 3:], before[:, 3:])
+
+
+def test_regularisers_against_finite_differences() -> None:
+    packed = packed_scene(50).astype(np.float64)
+    gradient = np.zeros_like(packed)
+    add_regularisers(packed, gradient, 0.3, 0.7)
+
+    def value(p: np.ndarray) -> float:
+        return 0.3 * (1 / (1 + np.exp(-p[:, 10]))).mean() + 0.7 * np.exp(p[:, 7:10]).mean()
+
+    for column in (7, 9, 10):
+        up, down = packed.copy(), packed.copy()
+        up[5, column] += 1e-5
+        down[5, column] -= 1e-5
+        assert gradient[5, column] == pytest.approx((value(up) - value(down)) / 2e-5, rel=1e-4)
 
 
 def test_gaussians_lie_along_their_normals_and_are_held_there() -> None:

@@ -68,7 +68,7 @@ def test_nothing_of_our_own_is_in_the_paper_and_its_baselines(name: str) -> None
         "light": "none", "headlight": 0.0, "lambda_depth": 0.0, "coarse_fraction": 0.0,
         "hold_surface": False, "warp_levels": 0, "fill_share": 1.0, "trusted_confidence": 1.0,
         "normal_neighbours": 0, "initial_opacity": 0.1, "initial_scale": 1.0, "sh_degree": 3,
-        "exposure": False, "lambda_tv": 0.0,
+        "exposure": False, "strategy": "default", "lambda_tv": 0.0,
     }  # fmt: skip
     assert {key: fit[key] for key in off} == off
     assert fit["saturation"] > 1
@@ -84,9 +84,9 @@ def test_a_method_has_the_parts_that_it_names() -> None:
     assert {part.name for part in PARTS} == set(get_args(PartName))
     ours, none = FitConfig(), FitConfig(parts=[])
     assert none.light == "none" and not (none.densify or none.optimize_poses or none.warp_levels)
-    named = FitConfig(parts=["poses", "density", "colours"], colour_steps=9, light="camera")
-    assert named.optimize_poses and named.densify
-    assert (named.colour_steps, named.light) == (9, "camera")
+    named = FitConfig(parts=["poses", "mcmc"], scale_reg=0.5, light="camera")
+    assert named.optimize_poses and named.densify and named.strategy == "mcmc"
+    assert (named.opacity_reg, named.scale_reg, named.light) == (0.01, 0.5, "camera")
     assert result_fields(ours) == result_fields(FitConfig(parts="auto"))
     assert "parts" not in result_fields(none)  # what they come to is in the other settings
     with pytest.raises(ValidationError, match="parts"):

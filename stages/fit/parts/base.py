@@ -71,10 +71,11 @@ class Part:
 
     def __init_subclass__(
         cls, switch: str | None = None, on: Any = None, off: Any = None, needs: Sequence[str] = (),
-        absent: Mapping[str, Any] | None = None, kept: Sequence[str] = (),
+        present: Mapping[str, Any] | None = None, absent: Mapping[str, Any] | None = None,
+        kept: Sequence[str] = (),
     ) -> None:  # fmt: skip
         cls.name, cls.switch, cls.needs, cls.kept = cls.__name__.lower(), switch, needs, kept
-        cls.present = {} if on is None else {str(switch): on}
+        cls.present = dict(present or ({} if on is None else {str(switch): on}))
         cls.absent = dict(absent or ({} if off is None else {str(switch): off}))
 
     @classmethod

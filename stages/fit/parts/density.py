@@ -47,6 +47,8 @@ class Density(
     class Settings(PartSettings):
         densify: AutoBool = automatic({5: False, 6: True})
         """clone and split Gaussians: few views overfit by it"""
+        strategy: Literal["default", "mcmc"] = "default"
+        """where densify is on: by cloning and splitting (3DGS), or by sampling (3DGS-MCMC)"""
         absgrad: Literal["split", "both", "off"] = "split"
         """absolute gradients decide on: splits (AbsGS), splits and clones (gsplat), neither
         (3DGS)"""
@@ -73,6 +75,11 @@ class Density(
     def __init__(self, fit: Trainer) -> None:
         super().__init__(fit)
         self.statistics = numerics.density.DensityStatistics.empty(len(fit.packed))
+
+    @classmethod
+    def of(cls, fit: Trainer) -> Part | None:
+        wanted = "mcmc" if cls.name == "mcmc" else "default"
+        return super().of(fit) if fit.settings.strategy == wanted else None
 
     def until(self, fit: Trainer) -> int:
         """The last iteration of densification."""
@@ -116,19 +123,54 @@ class Density(
         self.statistics = self.statistics.empty(len(source))
 
 
+class Mcmc(
+    Density, switch="densify",
+    present={"densify": True, "strategy": "mcmc", "opacity_reg": 0.01, "scale_reg": 0.01},
+):  # fmt: skip
+    """The dead move to the living, and noise keeps the positions exploring."""
+
+    class Settings(PartSettings):
+        noise_lr: Weight = 5e5
+        """mcmc: noise, relative to the learning rate of positions"""
+        opacity_reg: Weight = 0.0
+        """weight of the mean opacity in the loss (mcmc: 0.01)"""
+        scale_reg: Weight = 0.0
+        """weight of the mean scale in the loss (mcmc: 0.01)"""
+
+    def follow(self, fit: Trainer, step: Step) -> None:
+        numerics.density.add_noise(
+            fit.packed, self.settings.noise_lr * float(step.rates[0]), fit.random
+        )
+
+    def populate(self, fit: Trainer, step: Step) -> None:
+        s = self.settings
+        if self.due(fit):
+            fit.replace(
+                *numerics.density.relocate(fit.packed, s.prune_opacity, s.max_gaussians, fit.random)
+            )
+
+
 class Isotropic(Part, switch="isotropic", on=True, off=False):
-    """The three scales of each Gaussian are kept equal."""
+    """Opacity and scale have a price, and scales may be kept equal."""
 
     class Settings(PartSettings):
         isotropic: bool = False
         """keep the three scales of each Gaussian equal (with hold_surface and detail false only)"""
 
+    @classmethod
+    def of(cls, fit: Trainer) -> Part | None:
+        s = fit.settings
+        return cls(fit) if s.isotropic or s.opacity_reg > 0 or s.scale_reg > 0 else None
+
     def guide(self, fit: Trainer, step: Step) -> None:
-        gradient = step.gradients.packed
-        gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
+        s, gradient = self.settings, step.gradients.packed
+        numerics.density.add_regularisers(fit.packed, gradient, s.opacity_reg, s.scale_reg)
+        if s.isotropic:
+            gradient[:, 7:10] = gradient[:, 7:10].mean(1, keepdims=True)
 
     def pace(self, step: Step) -> None:
-        step.rates[3:7] = 0
+        if self.settings.isotropic:
+            step.rates[3:7] = 0
 
 
 class Floaters(
