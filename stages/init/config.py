@@ -57,9 +57,15 @@ class DenseConfig(StageConfig):
     max_volume: int = Field(
         DENSE.max_volume, ge=1_000_000, description="pixels times depths that are in memory at once"
     )
+    polish: int = Field(
+        DENSE.polish, ge=0, le=20, description="passes of PatchMatch after the sweep; 0: none"
+    )
+    polish_window: int = Field(
+        DENSE.polish_window, ge=3, le=31, description="side of its window, px, odd"
+    )
     fill: bool = Field(DENSE.fill, description="complete the depth where stereo knows nothing")
 
-    @field_validator("window")
+    @field_validator("window", "polish_window")
     @classmethod
     def _odd(cls, value: int) -> int:
         if value % 2 == 0:

@@ -29,6 +29,8 @@ class DenseOptions:
         relative_depth: how well views must agree.
         min_agreeing: views that must agree; 0: one, two from 6 views on, three from 12 on.
         speckle: islands of fewer pixels are dropped.
+        polish: passes of PatchMatch with slanted windows after the sweep; 0: none.
+        polish_window: side of its window in pixels, odd.
         fill: complete the depth where stereo knows nothing.
     """
 
@@ -44,6 +46,8 @@ class DenseOptions:
     relative_depth: float = 0.01
     min_agreeing: int = 0
     speckle: int = 30
+    polish: int = 0
+    polish_window: int = 7
     fill: bool = True
 
 

@@ -17,6 +17,7 @@ from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.consistency import camera_table, check, stacked
 from stages.stereo.fill import complete, distance_to
 from stages.stereo.options import METHODS, DenseOptions, DenseView
+from stages.stereo.polish import polish, source_maps
 from stages.stereo.pyramid import Level, halved, level_count, planes_at
 from stages.stereo.sgbm import ASSUMED_CORRELATION, sgbm_depth
 from stages.stereo.sources import (
@@ -195,7 +196,14 @@ def _sweep_view(
     # The first and the last plane stand for all that lies beyond the range.
     ncc = np.where((plane < 1) | (plane > planes - 2), np.float32(-1), ncc).astype(np.float32)
     depth = 1.0 / (ends[0] + (ends[1] - ends[0]) / (planes - 1) * plane)
-    return depth.astype(np.float32), ncc
+    if not options.polish:
+        return depth.astype(np.float32), ncc
+    kept = np.where(ncc > options.min_ncc, depth, 0).astype(np.float32)
+    step = (ends[1] - ends[0]) / (planes - 1) / max(float(np.mean(ends)), 1e-12)
+    return polish(
+        own.gray, own.usable, stack, sizes, source_maps(camera, lenses), kept, ncc,
+        options.polish, options.polish_window, float(step), index,
+    )  # fmt: skip
 
 
 def _sgbm_view(

@@ -13,6 +13,7 @@ from stages.stereo.aggregate import aggregate, decide
 from stages.stereo.appearance import highlights, normals_from_depth, to_gray
 from stages.stereo.fill import continued
 from stages.stereo.options import DenseOptions, DenseView
+from stages.stereo.polish import polish, source_maps
 from stages.stereo.reconstruct import dense_depths
 from stages.stereo.sgbm import sgbm_depth
 from stages.stereo.sources import inverse_depth_range, scene_points, select_sources
@@ -301,6 +302,44 @@ def test_three_frames_of_the_scan_video():
     assert np.median(millimetres) < 0.1
     assert np.percentile(millimetres, 90) < 0.45
     assert np.mean(millimetres > 2) < 0.02
+
+
+def test_polish_brings_disturbed_depth_back_to_the_surface():
+    cameras, images, depths, _ = scene((-9.0, 0.0, 9.0))
+    grays = [to_gray(image) for image in images]
+    usable = everywhere(images)
+    stack, sizes = stack_sources([grays[0], grays[2]], [usable[0], usable[2]])
+    maps = source_maps(cameras[1], [cameras[0], cameras[2]])
+    truth = depths[1].astype(np.float32)
+    rng = np.random.default_rng(4)
+    disturbed = truth * (1 + 0.02 * rng.normal(size=truth.shape)).astype(np.float32)
+    disturbed[rng.random(truth.shape) < 0.2] = 0  # holes are filled from beside
+    score = np.zeros(truth.shape, np.float32)
+
+    def polished(passes: int) -> np.ndarray:
+        return polish(
+            grays[1], usable[1], stack, sizes, maps, disturbed, score, passes, 7, 0.02, 1
+        )[0]
+
+    def error(found: np.ndarray) -> float:
+        known = found > 0
+        return float(np.median(np.abs(found - truth)[known] / truth[known]))
+
+    np.testing.assert_allclose(polished(0), disturbed, rtol=1e-6)
+    found = polished(3)
+    assert error(found) < 0.3 * error(disturbed)
+    assert (found > 0).mean() > 0.97
+    assert polished(3).tobytes() == found.tobytes()
+
+
+def test_polish_is_an_option_of_the_sweep(three):
+    cameras, images, depths, sparse, *_ = three
+    options = replace(OPTIONS, polish=1)
+    found = dense_depths(images, everywhere(images), cameras, sparse, options, 2, lambda *_: None)
+    for view, truth in zip(found, depths, strict=True):
+        assert np.median(relative_error(view, truth)) < 0.003
+    again = dense_depths(images, everywhere(images), cameras, sparse, options, 1, lambda *_: None)
+    assert same(found, again)
 
 
 def test_ranges_hold_what_the_coarser_level_found():
