@@ -27,6 +27,7 @@ from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photos.photo import FullSize
 from stages.init.dental.turned_sheet import turned_sheet
+from stages.photographs.copies import turned_copies
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -148,9 +149,17 @@ def place_teeth(
     read = [_resized(d, view) for d, view in zip(dentitions, small, strict=True)]
     shrunk = [focal and focal * s for focal, s in zip(focals, scales, strict=True)]
 
+    copies = turned_copies({k: small[k].image for k, d in enumerate(read) if d is not None})
+
     def placed_by(views: list[View], dentitions: list[Dentition | None]) -> ArchFit:
         images, valid = [view.image for view in views], [view.valid() for view in views]
-        return fit_arch(dentitions, images, valid, shrunk, arch, threads, progress, names, cameras)
+        fit = fit_arch(dentitions, images, valid, shrunk, arch, threads, progress, names, cameras)
+        both = [pair for pair in copies if all(dentitions[k] is not None for k in pair)]
+        return fit.doubted(
+            f"{names[a]} and {names[b]} are one picture, one of them turned over: leave out the "
+            "one that shows the patient's right and left the wrong way round"
+            for a, b in both
+        )
 
     if cameras is None:
         turned = fit_turned(small, read, names, placed_by)

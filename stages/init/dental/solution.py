@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -103,6 +103,10 @@ class ArchFit:
     def number_of(self, tooth: int) -> int:
         """FDI number of the tooth that stands in the place of a permanent one; 0 for 0."""
         return primary_of(tooth) if tooth in self.primary else tooth
+
+    def doubted(self, doubts: Iterable[str]) -> ArchFit:
+        """The same with more doubts about it."""
+        return replace(self, doubts=(*self.doubts, *doubts))
 
     def enlarged(self, factors: Sequence[float]) -> ArchFit:
         """The same for photographs so many times as large."""
