@@ -83,11 +83,19 @@ def shown(value: object, letters: int = 100) -> str:
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing."""
+    """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing.
+
+    Capitals make no difference, but where names differ in these alone.
+    """
     if len(name) > LONGEST_GUESSED:
         return ""
-    close = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.5)
-    return f" Did you mean '{close[0]}'?" if close else ""
+    names = list(allowed)
+    close = difflib.get_close_matches(
+        name.casefold(), [each.casefold() for each in names], n=1, cutoff=0.5
+    )
+    fitting = [each for each in names if each.casefold() in close]
+    best = difflib.get_close_matches(name, fitting, n=1, cutoff=0.0)
+    return f" Did you mean '{best[0]}'?" if best else ""
 
 
 def did_you_mean(wrong: str, names: Iterable[str], count: int = 5) -> str:

@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel, Field
 
 from pipeline.config import load_config
-from pipeline.errors import RequestError, did_you_mean
+from pipeline.errors import RequestError, did_you_mean, nearest
 from pipeline.front.settings import in_words, settings
 from pipeline.stage import usable_stages
 
@@ -97,3 +97,11 @@ def test_settings_of_toy_stages(toys: Path) -> None:
     assert set(usable_stages()) > {"scale"}
     with pytest.raises(RequestError, match=r"Did you mean scale.factor"):
         load_config(toys / "toy.yaml", ["scale.factr=3"])
+
+
+def test_capitals_do_not_hide_the_nearest_name() -> None:
+    assert nearest("1_FRONTAL.JPG", ["0_right.jpg", "1_frontal.jpg"]) == (
+        " Did you mean '1_frontal.jpg'?"
+    )
+    assert nearest("b.JPG", ["b.jpg", "B.JPG", "c.JPG"]) == " Did you mean 'B.JPG'?"
+    assert nearest("xyz", ["front", "right"]) == nearest("a", []) == ""
