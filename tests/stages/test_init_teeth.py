@@ -15,7 +15,7 @@ from pipeline.stage import LocalContext
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental import place
 from stages.init.dental.read import labelled_teeth
-from stages.init.dental.reconstruct import as_sentence, with_numbers
+from stages.init.dental.reconstruct import as_sentence, seen_from_elsewhere, with_numbers
 from stages.init.dental.scale import crown_width, scale_from_widths, width_doubts
 from stages.init.stage import InitStage
 from tests.stages.init_teeth_case import (
@@ -32,7 +32,7 @@ from tests.teeth_case import write
 
 def run(
     tmp_path, monkeypatch, found, read=None, asked=None, said=None, length=None, over=(),
-    wanted=(), **dental,
+    wanted=(), kinds=None, **dental,
 ):  # fmt: skip
     """The stage with the reconstruction as given (an exception is raised); what it was asked.
 
@@ -40,12 +40,14 @@ def run(
         said: text of `teeth.yaml`.
         over: photographs that the reconstruction turns over.
         wanted: photographs that it must not leave out.
+        kinds: from where photographs show the teeth, as a person says.
     """
 
     def reconstruct(views, names, dentitions, *args, kept, **kwargs):
         if asked is not None:
             asked.extend(dentitions)
         assert list(kept) == list(wanted)
+        assert kwargs["said"] == (kinds or {})
         if isinstance(found, Exception):
             raise found
         shown = [view.mirrored() if k in over else view for k, view in enumerate(views)]
@@ -287,7 +289,21 @@ def test_a_photograph_without_which_the_others_agree_is_named_and_set_aside(tmp_
 
 def test_a_photograph_that_a_person_wants_is_not_left_out(tmp_path, monkeypatch):
     said = "photographs: {p1.jpg: {use: true}, p2.jpg: {kind: left}}"
-    run(tmp_path, monkeypatch, found_teeth(), said=said, wanted=(1,))
+    run(tmp_path, monkeypatch, found_teeth(), said=said, wanted=(1,), kinds={2: "left"})
+
+
+def test_a_photograph_that_shows_another_side_than_a_person_says_is_doubtful():
+    fit = found_teeth().fit  # right, front, left
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    assert seen_from_elsewhere(fit, names, {}) == []
+    assert seen_from_elsewhere(fit, names, {0: "right", 1: "front", 2: "left"}) == []
+    (doubt,) = seen_from_elsewhere(fit, names, {0: "left", 2: "left"})
+    assert doubt.startswith(
+        "a.jpg is said to show the teeth from the left, but by its teeth it shows them from the "
+        "right: one of the two is wrong"
+    )
+    unplaced = replace(fit, views=(None, *fit.views[1:]))
+    assert seen_from_elsewhere(unplaced, names, {0: "left"}) == []
 
 
 def test_a_known_length_is_of_the_photograph_as_it_was_taken(tmp_path, monkeypatch):

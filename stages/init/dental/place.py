@@ -21,6 +21,7 @@ from stages.dentition.corrections import LEFT_OUT, SIDES, says_side
 from stages.init.config import DentalConfig, InitConfig
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.read import (
+    said_to_show,
     said_to_use,
     set_aside_reasons,
     teeth_to_place_by,
@@ -65,6 +66,7 @@ def from_teeth(context: StageContext, views: Views) -> None:
             arch_options(context, views, dentitions), surface_options(config.dental),
             accept_doubtful=config.dental.accept_doubtful, threads=context.threads,
             progress=context.progress, kept=said_to_use(context, views),
+            said=said_to_show(context, views),
         )  # fmt: skip
     except ReconstructionError as doubtful:
         kept = doubtful.artifacts.get("teeth")

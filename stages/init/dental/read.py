@@ -9,6 +9,7 @@ from pipeline.artifacts.dental.corrections import (
     CORRECTIONS,
     Corrections,
     CrownCorrection,
+    Kind,
     PhotoCorrection,
     read_corrections,
 )
@@ -33,15 +34,24 @@ def turned_as_said(context: StageContext, views: Views) -> Views:
 
 def said_to_use(context: StageContext, views: Views) -> list[int]:
     """Which of the views a person wants to be used, whatever they show."""
+    said = _said_of_photographs(context)
+    return [k for k, view in enumerate(views.views) if view.name in said and said[view.name].use]
+
+
+def said_to_show(context: StageContext, views: Views) -> dict[int, Kind]:
+    """From where each of the views shows the teeth, if a person has said so."""
+    said = _said_of_photographs(context)
+    kinds = {k: said[view.name].kind for k, view in enumerate(views.views) if view.name in said}
+    return {k: kind for k, kind in kinds.items() if kind is not None}
+
+
+def _said_of_photographs(context: StageContext) -> dict[str, PhotoCorrection]:
+    """View name -> what a person has said of it."""
     if CORRECTIONS not in context.sources:
-        return []
+        return {}
     said = read_corrections(context.sources[CORRECTIONS])
-    wanted = {
-        name
-        for name, (_, photo) in photographs_of(context.load("views"), said).items()
-        if photo.use
-    }
-    return [k for k, view in enumerate(views.views) if view.name in wanted]
+    found = photographs_of(context.load("views"), said)
+    return {name: photo for name, (_, photo) in found.items()}
 
 
 def without_left_out(context: StageContext, views: Views) -> Views:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts.dental.corrections import Kind
 from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
@@ -39,6 +40,11 @@ HOW_TO_SHOOT_TEETH = (
     "lips drawn back so that the gum line of all teeth shows, all sharp and at the same zoom; or a "
     "short film or more photographs, no more than 20 degrees apart."
 )
+
+
+#: Role of a photograph -> what a person calls it.
+FROM: Mapping[str, Kind] = {"right": "right", "frontal": "front", "left": "left"}
+NOTHING_SAID: Mapping[int, Kind] = {}
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,7 @@ def reconstruct_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, surface: SurfaceOptions, *,
     accept_doubtful: bool, threads: int, progress: Progress, kept: Collection[int] = (),
+    said: Mapping[int, Kind] = NOTHING_SAID,
 ) -> Reconstruction:  # fmt: skip
     """Say which tooth is which, place the cameras, and make the surface.
 
@@ -108,6 +115,7 @@ def reconstruct_teeth(
         focals: focal lengths in pixels where known.
         accept_doubtful: go on although `ArchFit.doubts` says not to, if two views are placed.
         kept: photographs that are not left out, whatever they show.
+        said: from where some show the teeth, as a person says.
 
     Raises:
         ReconstructionError: no teeth, or the result is doubtful; pictures with the labels come
@@ -115,7 +123,7 @@ def reconstruct_teeth(
     """
     teeth = place_teeth(
         views, names, dentitions, focals, arch, accept_doubtful=accept_doubtful, threads=threads,
-        progress=progress, kept=kept,
+        progress=progress, kept=kept, said=said,
     )  # fmt: skip
     return with_surface(teeth, surface, threads, progress)
 
@@ -124,7 +132,7 @@ def place_teeth(
     views: list[View], names: list[str], dentitions: list[Dentition | None],
     focals: list[float | None], arch: ArchOptions, *, accept_doubtful: bool, threads: int,
     progress: Progress, cameras: list[Array] | None = None, scales: list[float] | None = None,
-    kept: Collection[int] = (),
+    kept: Collection[int] = (), said: Mapping[int, Kind] = NOTHING_SAID,
 ) -> PlacedTeeth:  # fmt: skip
     """Say which tooth is which, and place the cameras; arguments as for `reconstruct_teeth`.
 
@@ -156,9 +164,14 @@ def place_teeth(
         fit = fit_arch(dentitions, images, valid, shrunk, arch, threads, progress, names, cameras)
         both = [pair for pair in copies if all(dentitions[k] is not None for k in pair)]
         return fit.doubted(
-            f"{names[a]} and {names[b]} are one picture, one of them turned over: leave out the "
-            "one that shows the patient's right and left the wrong way round"
-            for a, b in both
+            [
+                *(
+                    f"{names[a]} and {names[b]} are one picture, one of them turned over: leave "
+                    "out the one that shows the patient's right and left the wrong way round"
+                    for a, b in both
+                ),
+                *seen_from_elsewhere(fit, names, said),
+            ]
         )
 
     if cameras is None:
@@ -195,6 +208,20 @@ def place_teeth(
         for view, d in zip(views, numbered, strict=True)
     ]
     return PlacedTeeth(views, numbered, fit, turned, full)
+
+
+def seen_from_elsewhere(fit: ArchFit, names: Sequence[str], said: Mapping[int, Kind]) -> list[str]:
+    """A doubt for each photograph whose teeth are seen from another side than a person says."""
+    doubts = []
+    for k, kind in said.items():
+        placed = fit.views[k]
+        shown = FROM.get(placed.role) if placed else None
+        if shown is not None and shown != kind:
+            doubts.append(
+                f"{names[k]} is said to show the teeth from the {kind}, but by its teeth it shows "
+                f"them from the {shown}: one of the two is wrong, or it is a mirror image"
+            )
+    return doubts
 
 
 def as_sentence(doubt: str, names: Sequence[str]) -> str:
