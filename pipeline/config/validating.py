@@ -121,8 +121,11 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
         )
     about = _description(model, location)
     given = error.get("input")
+    hint = ""
+    if isinstance(given, str) and why.startswith("Input should be '"):
+        hint = nearest(given, re.findall("'([^']*)'", why))
     return (
-        f"{dotted}={'null' if given is None else shown(given)} is not allowed: {why}."
+        f"{dotted}={'null' if given is None else shown(given)} is not allowed: {why}.{hint}"
         f"{f' It means: {about}' if about else ''}"
     )
 

@@ -87,6 +87,20 @@ def test_a_preset_of_another_shape_is_told_which(toys: Path, text: str, told: st
         load_config(toys / "mine.yaml")
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("init.method=dentl", "or 'files'. Did you mean 'dental'"),
+        ("init.dental.order=rihgt,frontal,left", "Did you mean 'right'"),
+        ("views.long_side=auot", "or a whole number. Did you mean 'auto'"),
+        ("views.long_side=ten", "or a whole number. It means"),
+    ],
+)
+def test_a_misspelled_choice_names_the_nearest(given: str, told: str) -> None:
+    with pytest.raises(RequestError, match=told):
+        load_config("dentalsplat", [given])
+
+
 def test_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(RequestError, match="Did you mean 'dentalsplat'"):
         load_config("dentalsplot")
