@@ -57,14 +57,19 @@ def plan_stage(
         images: what the user gave.
 
     Raises:
-        RequestError: the photographs can't be found or read, or none are named.
+        RequestError: the photographs can't be found or read, or none are named; another file that
+            the settings name is wrong.
     """
     stage = get_stage(name)
     inputs = stage_inputs(stage, table)
     pointer = store.pointer(name)
     failure = store.failures.of(name)
     waiting = sorted({entry.stage for entry in inputs.values() if entry.result is None})
+    notes: list[str] = []
+    request = {"images": list(images), "workspace": store.root, "tell": notes.append}
     if waiting:
+        if not stage.uses_sources:
+            _sources(stage, config, request)  # what is wrong there is said before the others run
         state = "pending" if pointer else "missing"
         return PlannedStage(name, state, inputs, [f"depends on {' and '.join(waiting)}"])
     if stage.uses_sources and not images:
@@ -72,8 +77,6 @@ def plan_stage(
             f"No photographs are named, and {store.root} remembers none: no run was started there. "
             f"Name them as well: pipeline run PHOTOGRAPHS -w {quote(str(store.root))}"
         )
-    notes: list[str] = []
-    request = {"images": list(images), "workspace": store.root, "tell": notes.append}
     sources = _sources(stage, config, request)
     hashes = {label: hash_source(label, path) for label, path in sources.items()}
     material = key_material(stage, config, inputs, hashes)

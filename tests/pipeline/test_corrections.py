@@ -217,3 +217,16 @@ def test_what_a_failed_stage_made_is_kept_until_one_succeeds(
         run("count.fail=again")
     assert not folder.exists() and not (toys / "w" / "check.html").exists()
     run()
+
+
+def test_a_wrong_file_is_refused_before_the_stages_that_come_first_run(
+    toys: Path, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sources(self: Any, config: Any, request: Any) -> dict[str, Path]:
+        path = corrections_file(str(toys / "none.yaml"), request, "scale.labels")
+        return {"teeth.yaml": path} if path else {}
+
+    monkeypatch.setattr(toy.ScaleStage, "sources", sources)
+    with pytest.raises(RequestError, match=r"scale\.labels: there is no file"):
+        run()
+    assert not (toys / "w" / "read").exists()
