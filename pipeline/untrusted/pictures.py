@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 KNOWN = "JPEG, PNG, TIFF, WebP, HEIC, BMP or DICOM"
 #: How the names of pictures end; of DICOM files apart, which may hold none.
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
+SUFFIXES = (".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".bmp")
 MAX_PIXELS = 300_000_000
 #: The longest side that a JPEG can have.
 MAX_SIDE = 65_535

@@ -24,6 +24,11 @@ VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".3gp", ".mts",
     ".m2ts", ".ts",
 )  # fmt: skip
+#: Of pictures in formats that are not read: such a one in a folder is missed, not meant for others.
+OTHER_PICTURES = (
+    ".avif", ".gif", ".jxl", ".jp2", ".psd",
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw",
+)  # fmt: skip
 MASK_PREFIX = "masks/"
 #: Names of folders with photographs, beside others with depth maps or masks.
 USUAL_FOLDERS = {"images", "photos", "photographs", "frames", "rgb"}
@@ -93,7 +98,7 @@ def find_images(
     Args:
         requested: folders (the images directly in them), image files, patterns such as
             ``photos/*.jpg``, or one video.
-        tell: called with what a pattern matches and is not taken.
+        tell: called with what a pattern matches or a folder holds and is not taken.
 
     Returns:
         Labels are file names; where two files share one, the folder's name comes before it.
@@ -212,7 +217,7 @@ def _expand(item: str | Path, tell: Callable[[str], None]) -> list[Path]:
             "several files, a pattern in quotes such as 'photos/*.jpg', or a video."
         )
     if stat.S_ISDIR(status.st_mode):
-        return _expand_folder(path)
+        return _expand_folder(path, tell)
     _refuse_special(path, "Among the photographs,")
     if not is_photograph(path) and not is_video(path):
         raise RequestError(
@@ -268,12 +273,13 @@ def _refuse_special(path: Path, what: str) -> None:
         )
 
 
-def _expand_folder(folder: Path) -> list[Path]:
+def _expand_folder(folder: Path, tell: Callable[[str], None]) -> list[Path]:
     entries = list_folder(folder)
     images = [entry.path for entry in entries if not entry.is_folder and is_photograph(entry.path)]
     for image in images:
         _refuse_special(image, "Among the photographs,")
     if images:
+        _tell_of_others(folder, entries, {image.stem for image in images}, tell)
         return images
     videos = [entry.path.name for entry in entries if is_video(entry.path)]
     advice = f"Photographs are {KNOWN}."
@@ -296,6 +302,28 @@ def _expand_folder(folder: Path) -> list[Path]:
             likely = min(inside, key=lambda path: path.name.lower() not in USUAL_FOLDERS)
             advice = f"Did you mean the folder in it: {likely}"
     raise RequestError(f"There is no photograph in {folder} ({_describe(entries)}). {advice}")
+
+
+def _tell_of_others(
+    folder: Path, entries: Sequence[Entry], read: set[str], tell: Callable[[str], None]
+) -> None:
+    """Say which pictures of a folder are in formats that are not read, but for those that lie there
+    in another format too, as cameras write both.
+
+    Args:
+        read: stems of the photographs that are taken.
+    """
+    others = [
+        printable(entry.path.name) for entry in entries
+        if entry.path.suffix.lower() in OTHER_PICTURES
+        and not entry.is_folder and entry.path.stem not in read
+    ]  # fmt: skip
+    if others:
+        them = "it" if len(others) == 1 else "them"
+        tell(
+            f"{', '.join(others[:3])}{', ...' if others[3:] else ''} in {folder}: left out, for "
+            f"photographs are read as {KNOWN}. To use {them} too, save {them} as JPEG."
+        )
 
 
 def _try_list(folder: Path) -> list[Entry]:

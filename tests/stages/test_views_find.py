@@ -320,3 +320,12 @@ def test_focal_from_the_sensor() -> None:
 )
 def test_no_focal(details: dict[int, Any]) -> None:
     assert focal_in_pixels(details, 1600, 900) is None
+
+
+def test_pictures_in_other_formats_are_not_passed_by_without_a_word(tmp_path: Path) -> None:
+    for name in ("right.jfif", "front.jpg", "left.AVIF", "front.cr2", "notes.txt"):
+        (tmp_path / name).touch()
+    told: list[str] = []
+    assert list(find_images([tmp_path], told.append)) == ["front.jpg", "right.jfif"]
+    (note,) = told
+    assert note.startswith(f"left.AVIF in {tmp_path}: left out") and "save it as JPEG" in note
