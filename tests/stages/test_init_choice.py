@@ -190,6 +190,33 @@ def test_teeth_come_first_where_features_have_no_chance_and_then_features(tmp_pa
     assert order == ["features", "dense"]
 
 
+def test_of_a_whole_folder_those_are_sounded_that_show_the_closed_bite(tmp_path, monkeypatch):
+    sounded = []
+
+    def few(grays, valid, focals, *_, **__):
+        assert len(grays) == len(valid) == len(focals)
+        sounded.append(len(grays))
+        return Sounding(1, ["features"])
+
+    monkeypatch.setattr("stages.init.dental.choice.sound", few)
+
+    def first(read, ordered=False):
+        views = replace(photographs(9), ordered=ordered)
+        inputs = {"views": views, "teeth": read}
+        context = LocalContext(InitConfig(), tmp_path, inputs, {}, threads=1)
+        ways = ByTeeth(context, views)
+        answer = ways.is_first(views.views, [None] * 9, ClassicalOptions())
+        assert ways.features is None  # of all photographs or of none
+        return answer
+
+    folder = read_teeth(9, aside=(1, 3, 4, 6, 7, 8))
+    assert first(folder) and sounded == [3]
+    # many views around a mouth; frames of a film; those that nobody looked at may link the others
+    assert not first(read_teeth(9)) and not first(folder, ordered=True)
+    unread = (*folder.views[:8], Dentition("008", SIZE[::-1], UNREAD))
+    assert not first(Teeth(unread)) and sounded == [3]
+
+
 @pytest.mark.parametrize(
     ("ordered", "aside", "roll", "upright"),
     [

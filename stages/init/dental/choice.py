@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.artifacts.teeth import UNREAD
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import ReconstructionError
 from pipeline.stage import StageContext
@@ -23,7 +24,8 @@ DENTAL_VIEWS = (2, 12)
 #: no more.
 ENOUGH = 3
 #: Of so many it is asked first whether features may link them: more around one mouth are never all
-#: as far apart as that they can't.
+#: as far apart as that they can't. Of a clinic's whole folder those are asked that show the closed
+#: bite: open mouths, jaws from above and what is shown twice link nothing that they don't.
 SOUNDED_VIEWS = 6
 
 
@@ -91,15 +93,25 @@ class ByTeeth:
             options: of the attempt by features.
         """
         shown = self.to_try()
-        if len(self.views) > SOUNDED_VIEWS or not shown:
+        if not shown:
+            return False
+        asked = list(range(len(views)))
+        if len(views) > SOUNDED_VIEWS and not self.views.ordered and self._all_were_read():
+            asked = [k for k in asked if views[k].name in shown]
+        if len(asked) > SOUNDED_VIEWS:
             return False
         sounding = sound(
-            [view.gray() for view in views], [view.valid() for view in views], focals,
-            self.views.ordered, options, seed=self.context.seed, threads=self.context.threads,
-            scratch=self.context.scratch,
+            [views[k].gray() for k in asked], [views[k].valid() for k in asked],
+            [focals[k] for k in asked], self.views.ordered, options, seed=self.context.seed,
+            threads=self.context.threads, scratch=self.context.scratch,
         )  # fmt: skip
-        self.features = sounding.features
+        if len(asked) == len(views):
+            self.features = sounding.features
         return sounding.linked < min(ENOUGH, len(shown))
+
+    def _all_were_read(self) -> bool:
+        read = labelled_teeth(self.context, self.views).views
+        return all(dentition.kind != UNREAD for dentition in read)
 
     def knows_more(self, placed: set[str]) -> bool:
         """Would it place a mouth of which features have placed hardly any?
