@@ -93,4 +93,7 @@ def test_nothing_measured_leaves_the_crown_shapes() -> None:
     for a, b in zip(same, shapes, strict=True):
         assert a is not None
         assert b is not None
-        np.testing.assert_allclose(a.depth, b.depth, atol=0.02)
+        shown = b.depth > 0
+        np.testing.assert_allclose(a.depth[shown], b.depth[shown], atol=0.02)
+        # but for gum beyond the even rim of the cloud, which this has none of
+        assert (a.depth > 0)[~shown].mean() < 1e-3
