@@ -1,4 +1,4 @@
-"""Terms of the loss beside colour: depth of the input points, optical flow, total variation.
+"""Terms of the loss beside colour: depth of the points, flow, silhouette, total variation.
 
 Depth and flow take turns, each twice as heavy: they change slowly, and cost planes that are drawn.
 """
