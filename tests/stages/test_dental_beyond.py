@@ -7,7 +7,8 @@ import numpy as np
 from pipeline.artifacts.confidence import FILLED, MEASURED
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.beyond import without_guesses_beyond
-from stages.init.dental.surface.dense import ArchSurface, SurfaceView
+from stages.init.dental.surface.chart.looks import SurfaceView
+from stages.init.dental.surface.dense import ArchSurface
 
 SIZE = (20, 40)  # height, width
 FOCAL, AWAY = 20.0, 10.0

@@ -113,6 +113,17 @@ def test_crowns_stay_where_they_are_beside_brackets() -> None:
     assert np.median(np.abs(with_them - without)[crowns]) < 0.1
 
 
+def test_flanks_of_brackets_are_not_laid_on_what_is_behind_them() -> None:
+    """Beyond the canines the frontal photograph shows flanks, and those from the sides fronts."""
+    photo = painted(BLACK)[1]
+    first, last = (np.flatnonzero(photo.fronts[tooth].any(0)) for tooth in (13, 23))
+    beyond = photo.boxes.copy()
+    beyond[:, first.min() : last.max() + 1] = False
+    assert (surface(None).views[1].depth[beyond] > 0).mean() > 0.25, "crowns behind them are shown"
+    assert not surface(BLACK).views[1].depth[beyond].any()
+    assert (surface(BLACK).views[1].depth[photo.fronts[11]] > 0).all()
+
+
 def test_one_photograph_alone_raises_nothing() -> None:
     """Nothing tells how high it stands."""
     images, valid, dentitions, fit, _ = plain()

@@ -43,7 +43,7 @@ from stages.init.dental.reconstruct import (
     with_surface,
 )
 from stages.init.dental.solution import ArchFit
-from stages.init.dental.surface.dense import SurfaceView
+from stages.init.dental.surface.chart.looks import SurfaceView
 from stages.init.dental.surface.options import SurfaceOptions, SweepRound
 from stages.init.place import photo_name
 from stages.init.placement import Placement

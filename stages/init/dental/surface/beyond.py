@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from pipeline.artifacts.confidence import MEASURED
 from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.surface.dense import ArchSurface, SurfaceView
+from stages.init.dental.surface.chart.looks import SurfaceView
+from stages.init.dental.surface.dense import ArchSurface
 
 Mask = npt.NDArray[np.bool_]
 

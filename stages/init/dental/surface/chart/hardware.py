@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stages.init.dental.surface.chart.jaws import Chart
+from stages.init.dental.surface.chart.jaws import ROW_SMOOTHING, Chart, facing, smooth_normals
 from stages.init.dental.surface.photos.photo import Photo
 from stages.init.dental.surface.photos.tissue import disc
 
 Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 #: Square mm that two photographs show on a jaw with braces: about four brackets. Real patients: 149
 #: with braces, 0 to 23 on 25 jaws without (stains, fillings, shade between crowns); generated ones:
@@ -40,7 +41,10 @@ _AS_GOOD, _HIGHER = 0.8, 0.02
 _LEAST_OVERLAP = 0.4
 #: A sample is raised where two photographs are so sure of it.
 _SURE = 0.5
-#: Gaps in it up to this wide to either side (mm) are raised with it: what shines.
+#: From this cosine down a bracket, 3 to 3.5 mm wide and 2 to 2.5 mm high, shows more of its flank
+#: than of its front, and hides as much of what is behind it.
+_FLANKS = 0.55
+#: Gaps in it up to this wide to either side (mm) go with it: what shines.
 _GAP = 0.5
 #: The raised part's rim is smoothed over this length (mm).
 _RIM = 0.2
@@ -102,6 +106,28 @@ def raise_hardware(
     )
     raised = (whole * height[None]).astype(np.float32)
     chart.radius = chart.radius + cv2.GaussianBlur(raised, (0, 0), _RIM * chart.grid.density)
+
+
+def behind_flanks(chart: Chart, photos: list[Photo], seen: npt.NDArray[np.bool_]) -> list[Mask]:
+    """Per photograph [H, W] bool: where metal in it is the flank of a bracket that stands before.
+
+    Another photograph shows these samples from their front. What a photograph shows at such a slant
+    would be laid on the crowns and the gum behind, and stay there when the view turns.
+
+    Args:
+        chart: of a jaw with braces; photos: the photographs.
+        seen: [V, H, W] bool: the photograph shows this sample.
+    """
+    normals = smooth_normals(chart.radius, chart.grid, ROW_SMOOTHING)
+    faces = np.stack([facing(photo, chart.points, normals) for photo in photos])
+    front = (seen & (faces > _FLANKS)).any(axis=0)
+    return [front & (cosine <= _FLANKS) for cosine in faces]
+
+
+def metal(photo: Photo) -> Mask:
+    """[h, w] bool: metal in a photograph, with what shines in it and beside it."""
+    wide = cv2.dilate(photo.hardware, disc(_GAP * photo.density))
+    return np.asarray(wide > _SURE)
 
 
 def _scores(points: Array32, photos: list[Photo]) -> list[Array32]:

@@ -42,7 +42,7 @@ _SURE = 2.0
 _NORMAL_SMOOTHING, FACING_SMOOTHING = 0.15, 1.5
 #: And of those that decide how a photograph faces the row, not each side of its crowns: half a
 #: tooth.
-_ROW_SMOOTHING = 4.5
+ROW_SMOOTHING = 4.5
 #: From here to there beyond the gum line (mm) trust in matches fades: gum is wet, and highlights
 #: move with the camera.
 _GUM_FADES = (0.5, 2.0)
@@ -202,7 +202,7 @@ def clearly_seen(
     The rim is even, and pieces too small for a tooth and its gum are left out.
     """
     points = chart.points
-    normals = smooth_normals(chart.radius, chart.grid, _ROW_SMOOTHING)
+    normals = smooth_normals(chart.radius, chart.grid, ROW_SMOOTHING)
     faces = np.stack([facing(photo, points, normals) for photo in photos])
     best = faces == faces.max(axis=0)
     clear = np.zeros(chart.grid.shape, bool)
