@@ -51,6 +51,21 @@ def test_another_patients_gum_is_another_in_any_light() -> None:
     assert max(d.any_light for d in found[:2]) < 0.1
 
 
+def test_brackets_are_not_the_colour_of_enamel() -> None:
+    """A photograph shows more of them than the other, as that from the front does."""
+
+    def braced(width: int) -> tuple[np.ndarray, SimpleNamespace]:
+        image, dentition = photograph()
+        for x in range(20, 180, 27):
+            image[47:67, x + 11 - width // 2 : x + 11 + width // 2] = (0.25, 0.24, 0.26)
+        return image, dentition
+
+    found = distances(braced(10), braced(18))
+    assert max(d.one_light for d in found) < 0.5 and max(d.any_light for d in found) < 0.1
+    other = distances(braced(10), braced(18), photograph(gum=(0.30, 0.20, 0.22)))
+    assert other[2].one_light > 3, "another patient's gum is another's beside braces, too"
+
+
 def test_a_photograph_without_gum_says_nothing() -> None:
     image, dentition = photograph()
     everything = SimpleNamespace(mask=np.ones((120, 200), bool), band_height=60.0)

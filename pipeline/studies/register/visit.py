@@ -20,7 +20,7 @@ from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
 from pipeline.geometry.world import move_camera
 from pipeline.store import Store
-from pipeline.studies.register.pictures.hardware import braces_in, painted_over
+from pipeline.studies.register.pictures.hardware import painted_over
 from pipeline.studies.register.pictures.originals import larger_photographs
 
 Array = npt.NDArray[np.float64]
@@ -288,8 +288,10 @@ def without_braces(visit: Visit, pictures: Sequence[Floats]) -> Visit:
         visit: in mm.
         pictures: [H, W, 3] float32 sRGB in 0..1 of each of its photographs.
     """
-    labels, densities = ([getattr(k, name) for k in visit.looks] for name in ("labels", "density"))
-    found = braces_in(pictures, labels, densities)
+    from stages.init.dental.surface.photos.braces import braces_in
+
+    crowns, densities = [k.labels > 0 for k in visit.looks], [k.density for k in visit.looks]
+    found = braces_in(pictures, crowns, densities)
     if found is None:
         return visit
     looks = tuple(replace(k, hardware=h) for k, h in zip(visit.looks, found, strict=True))
