@@ -38,7 +38,7 @@ def run_register(
     from pipeline.measure import peak_mb_with_children
     from pipeline.running.reporter import Reporter
     from pipeline.studies.register.movement import words
-    from pipeline.studies.register.visit import warning_of
+    from pipeline.studies.register.writing import warning
 
     hears = reporter or Reporter()
     started = time.perf_counter()
@@ -61,8 +61,8 @@ def run_register(
         hears.stop()
     lines = [f"{tooth.tooth}: {words(tooth.parts, tooth.half)}" for tooth in moved]
     lines = lines or ["No tooth moved beyond the uncertainty."]
-    warning = warning_of(found.first, found.second)
-    return page, "\n".join([warning, *lines] if warning else lines)
+    told = warning(found)
+    return page, "\n".join([told, *lines] if told else lines)
 
 
 def _registered(

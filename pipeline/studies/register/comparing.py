@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.errors import ReconstructionError
 from pipeline.process.native import one_blas_thread
 from pipeline.studies.register import solving
 from pipeline.studies.register.both_ways import both_ways, mirrored
 from pipeline.studies.register.estimate import Estimate
 from pipeline.studies.register.geometry import first_frame, inverted, refined_frame
+from pipeline.studies.register.jaws import of_jaw, stand_otherwise, way_of_lower
 from pipeline.studies.register.movement import to_parts, tooth_axes
 from pipeline.studies.register.uncertainty import RANGE, measured, misfit
 from pipeline.studies.register.visit import Visit, scale_of
@@ -99,6 +102,9 @@ class Comparison:
         relative_scale: size of the second run's millimetre in the first's, as the runs have them.
         first_scaled_by: what the first run's lengths were multiplied by: 1, or as many of the
             second's millimetres as one of its own is, where the second's are the surer ones.
+        jaws: those that were compared each by itself, since they stand to each other otherwise than
+            at the first visit; the first of them gives the frame. Empty: all teeth together.
+        jaws_apart: how far the lower jaw then went against the upper one, mm; None: not known.
     """
 
     first: Visit
@@ -113,6 +119,8 @@ class Comparison:
     scale_source: str
     relative_scale: float
     first_scaled_by: float
+    jaws: tuple[Jaw, ...] = ()
+    jaws_apart: float | None = None
 
     @property
     def still(self) -> list[int]:
@@ -129,17 +137,74 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
     """
     frame, agreeing = _frame(first, second)
     for visit in (first, second):
-        try:
-            tooth_axes(visit.centres)
-        except ValueError as error:
-            raise ReconstructionError(
-                f"Of '{visit.name}' it can't be told what is mesial and what is buccal: {error}."
-            ) from error
+        _axes(visit)
     surer, scaled_by = first, 1.0
     if second.scale_doubt < first.scale_doubt:  # the surer millimetre counts for both
         surer, scaled_by = second, 1 / scale_of(frame)
         first = first.in_frame(np.diag([scaled_by] * 3 + [1.0]))
         frame, agreeing = _frame(first, second)
+    if stand_otherwise(first, second, LEAST_TEETH):
+        found = _jaw_by_jaw(first, second)
+    else:
+        found = _compared(first, second, frame, agreeing, _axes(first))
+    return replace(
+        found, scale_percent=surer.scale_percent, scale_source=surer.scale_source,
+        relative_scale=found.relative_scale / scaled_by, first_scaled_by=scaled_by,
+    )  # fmt: skip
+
+
+def _axes(visit: Visit) -> dict[int, Array]:
+    try:
+        return tooth_axes(visit.centres)
+    except ValueError as error:
+        raise ReconstructionError(
+            f"Of '{visit.name}' it can't be told what is mesial and what is buccal: {error}."
+        ) from error
+
+
+def _jaw_by_jaw(first: Visit, second: Visit) -> Comparison:
+    """Compare each jaw by itself; the frame is that of the upper one, if it can be compared.
+
+    The teeth of a jaw that can't be are not measured.
+    """
+    axes = _axes(first)
+    found: dict[Jaw, Comparison] = {}
+    failures = []
+    for jaw in JAWS:
+        a, b = of_jaw(first, jaw), of_jaw(second, jaw)
+        try:
+            _axes(a), _axes(b)
+            found[jaw] = _compared(a, b, *_frame(a, b), axes)
+        except ReconstructionError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    main = next(iter(found.values()))
+    teeth = sorted((t for one in found.values() for t in one.teeth), key=lambda t: t.tooth)
+    every = set(first.centres) | set(second.centres)
+    apart = None
+    if len(found) == len(JAWS):
+        frames = [one.first_from_second for one in found.values()]
+        apart = way_of_lower(first.centres, frames[0], frames[1])
+    return replace(
+        main, first=first, second=second, teeth=tuple(teeth),
+        missing=tuple(sorted(every - {tooth.tooth for tooth in teeth})),
+        likeness=min(one.likeness for one in found.values()),
+        share=min(one.share for one in found.values()),
+        residual=max(one.residual for one in found.values()),
+        jaws=tuple(found), jaws_apart=apart,
+    )  # fmt: skip
+
+
+def _compared(
+    first: Visit, second: Visit, frame: Array, agreeing: list[int], axes: Mapping[int, Array]
+) -> Comparison:
+    """What teeth did that were one rigid thing at both visits, but for those that moved.
+
+    Args:
+        frame: [4, 4] first_from_second to begin with. agreeing: teeth that agree with it.
+        axes: of the first visit's teeth (`movement.tooth_axes`).
+    """
     share = len(agreeing) / len(set(first.centres) & set(second.centres))
     frame = refined_frame(first, second, frame, agreeing)
     there, back = both_ways(first, second, frame, agreeing)
@@ -154,22 +219,21 @@ def compare_visits(first: Visit, second: Visit) -> Comparison:
             "at check.html of both workspaces: a wrong tooth number is the usual cause."
         )
     many = min(len(first.looks), len(second.looks)) >= MANY
-    teeth = _teeth(first, there, back, many)
+    teeth = _teeth(axes, there, back, many)
     # What went no farther than most do by noise alone may still be sure to have moved.
     while moved := {t.tooth for t in teeth if t.certain} & {*there.still, *back.still}:
         there, back = (
             replace(way, still=tuple(n for n in way.still if n not in moved))
             for way in (there, back)
         )
-        teeth = _teeth(first, there, back, many)
+        teeth = _teeth(axes, there, back, many)
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
     joint = refined_frame(first, second, frame, there.still)
     return Comparison(
         first, second, joint, tuple(teeth), tuple(sorted(missing)), likeness, share,
-        max(there.residual, back.residual), surer.scale_percent, surer.scale_source,
-        scale_of(joint) / scaled_by, scaled_by,
+        max(there.residual, back.residual), None, "", scale_of(joint), 1.0,
     )  # fmt: skip
 
 
@@ -223,13 +287,12 @@ def _mirrored(
     return found
 
 
-def _teeth(first: Visit, there: Estimate, back: Estimate, many: bool) -> list[Moved]:
+def _teeth(axes: Mapping[int, Array], there: Estimate, back: Estimate, many: bool) -> list[Moved]:
     """Both ways together: their mean; what they differ by adds to the doubt.
 
     So do pictures that do not fit, where photographs are few. Where they are many, a tooth that one
     way alone finds is not measured: nothing would tell if that is wrong.
     """
-    axes = tooth_axes(first.centres)
     result = []
     by_photograph = 1.0 if many else BY_PHOTOGRAPH
     forwards = measured(there, by_photograph)

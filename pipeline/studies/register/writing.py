@@ -34,10 +34,29 @@ NOTES = {
     "basis": "what the intervals stand on: few photographs; marks of the enamel; or, where these "
     "are too faint, optical flow, whose turns are far less sure",
     "reference": "teeth that stood still, against which everything is measured: a movement that "
-    "all teeth share can't be seen",
+    "all teeth share can't be seen, nor what all of a jaw do where 'warning' says that each jaw is "
+    "compared by itself",
 }
 #: Colours by distance: none, and this far and more (mm).
 FARTHEST = 1.5
+
+
+def warning(found: Comparison) -> str:
+    """What has to be known of the visits before any figure is read; mostly nothing."""
+    said = []
+    if len(found.jaws) > 1:
+        said.append(
+            "The jaws do not stand to each other as they did at the first visit (the lower one is "
+            f"{found.jaws_apart:.1f} mm from there), so each is compared by itself: teeth are "
+            "measured against teeth of their own jaw, and the second scene stands in the frame of "
+            "the first by the upper one."
+        )
+    elif found.jaws:
+        said.append(
+            "The jaws do not stand to each other as they did at the first visit, and only the "
+            f"{found.jaws[0]} one can be compared: the teeth of the other are not measured."
+        )
+    return " ".join([*said, *filter(None, [warning_of(found.first, found.second)])])
 
 
 def described(found: Comparison) -> dict[str, Any]:
@@ -48,7 +67,7 @@ def described(found: Comparison) -> dict[str, Any]:
         "first": found.first.name,
         "second": found.second.name,
         "notes": NOTES,
-        "warning": warning_of(found.first, found.second),
+        "warning": warning(found),
         "units": "mm",
         "scale_source": found.scale_source,
         "scale_deviation_percent": None if percent is None else round(percent, 2),

@@ -18,8 +18,8 @@ from pipeline.studies.register.comparing import Comparison, Moved
 from pipeline.studies.register.geometry import inverted
 from pipeline.studies.register.movement import OPPOSITE, PARTS, words
 from pipeline.studies.register.page.live import live_scenes
-from pipeline.studies.register.visit import Visit, in_frame, warning_of
-from pipeline.studies.register.writing import FARTHEST, color_of
+from pipeline.studies.register.visit import Visit, in_frame
+from pipeline.studies.register.writing import FARTHEST, color_of, warning
 
 Image = npt.NDArray[np.uint8]
 
@@ -39,7 +39,7 @@ def write_register_page(found: Comparison, out: Path, live: bool = True) -> Path
         table=movement_table(found), scenes=scenes(found),
         live=live_scenes(found, shown_cameras(found.first)) if live else None,
         tinted=tinted(found),
-        warning=warning_of(found.first, found.second),
+        warning=warning(found),
         said=[(t.tooth, words(t.parts, t.half)) for t in certain], farthest=FARTHEST,
         faint=", ".join(str(t.tooth) for t in found.teeth if t.basis == "flow"),
         still=", ".join(map(str, found.still)), missing=", ".join(map(str, found.missing)),
