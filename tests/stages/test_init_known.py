@@ -243,8 +243,10 @@ def test_wrong_cameras_are_refused_in_words(tmp_path):
         read_cameras(model_files(tmp_path).values())
     cameras, _ = read_cameras(model_files(SAMPLES).values())
     strangers = [View("a", np.zeros((3, 4, 3), np.float32), source_name="x.jpg")]
-    with pytest.raises(RequestError, match=r"fewer than two .* like frontal\.jpg.* like x\.jpg"):
+    with pytest.raises(RequestError, match=r"none of .* like frontal\.jpg.* like x\.jpg"):
         matching_cameras(cameras, strangers)
+    with pytest.raises(RequestError, match=r"frontal\.jpg alone has a camera.* two at least"):
+        matching_cameras(cameras[:1], sample_views().views)
     view = View("a", np.zeros((300, 300, 3), np.float32), source_size=(300, 300))
     with pytest.raises(RequestError, match="512 x 384"):
         as_pinhole(view, cameras[0])

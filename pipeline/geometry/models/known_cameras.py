@@ -223,10 +223,14 @@ def matching_cameras(
         )
     if len(best) >= 2:
         return {name: those[0] for name, those in best.items()}
+    if best:
+        raise RequestError(
+            f"{setting}: of the {len(views)} photographs {next(iter(best.values()))[0].name} alone "
+            "has a camera there; two at least are needed."
+        )
     raise RequestError(
-        f"{setting}: fewer than two of the {len(views)} photographs have a camera in the model. "
-        f"The names there are like {cameras[0].name}, the photographs' like "
-        f"{views[0].source_name or views[0].name}."
+        f"{setting}: none of the {len(views)} photographs has a camera there. The names there are "
+        f"like {cameras[0].name}, the photographs' like {views[0].source_name or views[0].name}."
     )
 
 
