@@ -10,9 +10,11 @@ import numpy as np
 import open3d
 import pytest
 
+from pipeline.artifacts.teeth import Teeth
 from pipeline.artifacts.views import View
 from pipeline.errors import RequestError
 from pipeline.geometry.models.model_points import as_points, read_model_points
+from pipeline.store import Store
 from pipeline.studies.compare import clouds, colmap_run, evidence, poses
 from pipeline.studies.compare.colmap_run import (
     SETTINGS,
@@ -22,9 +24,12 @@ from pipeline.studies.compare.colmap_run import (
     run_on_views,
     thresholds,
 )
+from pipeline.studies.compare.compare import _entries_of
+from pipeline.studies.compare.fits import fit_rows
 from pipeline.studies.compare.models import read_largest
 from pipeline.studies.compare.tables import tables_of
 from stages.views.orientation import make_upright, upright_from_stored
+from tests.studies import report_case as case
 from tests.studies.comparison_scene import TRUTH, moved, true_cameras, true_points, write_model
 
 IDENTITY = (1.0, np.eye(3), np.zeros(3))
@@ -39,6 +44,36 @@ def views_of(names):
 
 
 NAMES = [camera.name for camera in true_cameras()]
+
+
+def test_all_stages_before_a_row_count_in_its_seconds(tmp_path):
+    """The teeth's did not, which `init` waits for."""
+    store = Store(case.write_case(tmp_path / "w", ("views", "init")))
+    assert [entry.row["seconds"] for entry in _entries_of(store)] == [3.0]
+    case.write_result(tmp_path / "w", "teeth", [Teeth(())])
+    assert [entry.row["seconds"] for entry in _entries_of(store)] == [4.5]
+
+
+def test_what_belongs_to_another_run_or_failed_has_no_cameras(tmp_path):
+    """After `views` and `init` with other settings the rest stood beside them as if it were of one
+    run, and a stage that had failed bore the cameras of the one before."""
+    home = case.write_case(tmp_path / "w", ("views", "init"))
+    before = {"cameras": {"stage": "init", "content": "of an earlier run"}}
+    case.write_result(home, "align", [case.cameras(1.0), case.points(50)], inputs=before)
+    store = Store(home)
+    store.failures.record("fit", "0" * 64, "no such luck")
+    rows = {entry.name: entry for entry in _entries_of(store)}
+    assert len(rows["init (ours)"].cameras) == 3
+    assert "another result of 'init'" in rows["align (ours)"].row["failure"]
+    assert rows["fit (ours)"].row["failure"] == "no such luck"
+    for name in ("align (ours)", "fit (ours)"):
+        assert not rows[name].cameras and not rows[name].borrowed
+    case.write_result(home, "fit", [case.cameras(1.0)], inputs=before)
+    fits = fit_rows(
+        home, tmp_path / "f", None, "none", truth=None, mesh=None, threads=1, reporter=None,
+        message=print,
+    )  # fmt: skip
+    assert "has no fit" in fits[0]["failure"]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

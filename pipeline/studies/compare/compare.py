@@ -26,11 +26,13 @@ from pipeline.studies.compare.page import write_report
 from pipeline.studies.compare.tables import markdown, tables_of
 from pipeline.studies.report import run_report
 from pipeline.studies.report.compared import FILE, FOLDER
+from pipeline.studies.report.reading import renewed
 from pipeline.untrusted.paths import given_path, home_told
 from pipeline.workspace import read_request
 
-#: The stages whose cameras or points are compared where the workspace has them, in their order.
-STAGES = ("views", "init", "align", "swap", "sap", "flow", "fit")
+#: The stages up to the fit, in their order. Seconds of all of them count; cameras and points are
+#: compared of those that give some.
+STAGES = ("views", "teeth", "init", "align", "swap", "sap", "flow", "fit")
 #: How the rows of COLMAP are called.
 TITLES = {"defaults": "COLMAP, defaults", "sparse": "COLMAP, sparse setting"}
 GIVEN = "COLMAP, given model"
@@ -236,9 +238,15 @@ def _entries_of(store: Store) -> list[Entry]:
     found, seconds = [], 0.0
     for name in STAGES:
         result = store.current(name)
-        seconds += result.manifest["wall_seconds"] if result else 0.0
         entry = Entry(f"{name} (ours)")
-        if result is not None:
+        if result is not None and (other := renewed(store, result)):
+            if {"cameras", "points"} & result.contents.keys():
+                entry.row["failure"] = (
+                    f"made from another result of '{other}' than there is now; run the pipeline to "
+                    "its end first"
+                )
+        elif result is not None:
+            seconds += result.manifest["wall_seconds"]
             if "cameras" in result.contents:
                 entry.cameras = _loaded(store, result, "cameras").by_name()
             if "points" in result.contents:
@@ -251,7 +259,7 @@ def _entries_of(store: Store) -> list[Entry]:
     # `sap` thins points only, `fit` starts from those there are: the others hold on
     cameras: dict[str, Camera] = {}
     points: clouds.Array | None = None
-    for entry in found:
+    for entry in (entry for entry in found if "failure" not in entry.row):
         entry.borrowed = not entry.cameras and entry.points is not None
         cameras = entry.cameras = entry.cameras or cameras
         points = points if entry.points is None else entry.points

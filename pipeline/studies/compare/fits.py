@@ -19,6 +19,7 @@ from pipeline.front.commands import run
 from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
 from pipeline.store import Result, Store
+from pipeline.studies.report.reading import renewed
 from pipeline.untrusted.paths import home_told
 from pipeline.workspace import read_request
 
@@ -48,7 +49,7 @@ def fit_rows(
             gone, if anything.
     """
     store = Store(workspace)
-    results = {name: store.current(name) for name in REPEATED}
+    results = {name: _of_this_run(store, name) for name in REPEATED}
     rows = [_row_in_use(results)]
     present = [name for name in REPEATED if results[name] is not None]
     for title, points in (
@@ -115,6 +116,12 @@ def take_corrections(workspace: Path, folder: Path) -> None:
     read_corrections(said)
     folder.mkdir(parents=True, exist_ok=True)
     copyfile(said, folder / CORRECTIONS)
+
+
+def _of_this_run(store: Store, name: str) -> Result | None:
+    """The result in use of a stage, unless it was made from others than are in use now."""
+    result = store.current(name)
+    return None if result is None or renewed(store, result) else result
 
 
 def _row_in_use(results: Mapping[str, Result | None]) -> dict[str, Any]:
