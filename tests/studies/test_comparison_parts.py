@@ -324,7 +324,10 @@ def test_distances_between_clouds():
 
 def test_points_without_anything_to_measure_them_by_are_counted():
     row = {"name": "sap (ours)", "points": 4711}
-    figures = {"reference": "ground truth", "units": "mm", "cameras": [], "points": [row]}
+    figures = {
+        "reference": "ground truth", "reference_views": 3, "views": NAMES, "units": "mm",
+        "cameras": [], "points": [row],
+    }  # fmt: skip
     (table,) = tables_of(figures)
     assert table.rows == [["sap (ours)", "4,711"]]
     assert "nearest" not in table.explanation

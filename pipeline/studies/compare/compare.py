@@ -157,6 +157,7 @@ def _compare(
         "results": {name: used.key for name in STAGES if (used := store.current(name))},
         "views": [view.name for view in views],
         "reference": "ground truth" if truth else best.name if best else None,
+        "reference_views": len(reference),
         "units": units,
         "cameras": [entry.row for entry in entries if not entry.borrowed],
         "points": _point_rows(entries, best, reference, surface),

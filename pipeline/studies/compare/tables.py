@@ -71,6 +71,9 @@ def _cameras(figures: Mapping[str, Any]) -> Table:
         if figures["reference"]
         else "Nothing to measure against"
     )
+    known, views = figures["reference_views"], len(figures["views"])
+    if 0 < known < views:
+        against += f" (of the {known} of {views} views that have a camera there)"
     return Table(
         "Cameras",
         f"{against}, after a similarity of the cameras' centres and orientations; median / largest "
