@@ -122,6 +122,13 @@ def test_the_best_of_a_column_is_marked_and_the_papers_figures_are_not() -> None
     assert not any(entry.best for row in grid_table(costs)["table"].rows for entry in row)
 
 
+def test_the_mean_of_the_scenes_that_did_not_fail_is_not_the_best() -> None:
+    """It was marked, though of the scene that both could do the other's is better."""
+    rows = [["Ours", "27.00 ± 4.24 (n=2)"], ["Rival", "29.00 (1 of 2 failed)"], ["Other", "26.00"]]
+    grid = {"title": "T", "caption": "c", "columns": ["Method", "PSNR, 3 views"], "rows": rows}
+    assert [row[1].best for row in grid_table(grid)["table"].rows] == [True, False, False]
+
+
 def test_charts_have_the_papers_figures_where_it_scored_so() -> None:
     titles = {"ours": "Ours", "rival": "Rival"}
     found = results(cells_of_two_methods())
