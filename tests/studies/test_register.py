@@ -114,6 +114,20 @@ def test_intervals_hold_the_truth_and_say_who_moved(
     assert np.mean(inside) >= 0.95
 
 
+def test_visits_that_cannot_be_laid_over_each_other_are_not_called_two_patients(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One from the right, one from the left: they "agreed with a correlation of -1.00"."""
+    right = replace(found.first, looks=found.first.looks[:1])
+    left = replace(found.second, looks=found.second.looks[3:])
+    with pytest.raises(ReconstructionError, match="from nearly the same side"):
+        compare_visits(right, left)
+    nothing = [replace(way, blocks=()) for way in ways]
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: nothing)
+    with pytest.raises(ReconstructionError, match="No tooth of 'second' shows enough"):
+        compare_visits(found.first, found.second)
+
+
 def test_pictures_that_do_not_fit_widen_the_interval(
     found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:

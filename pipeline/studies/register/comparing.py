@@ -14,12 +14,13 @@ from pipeline.errors import ReconstructionError
 from pipeline.process.native import one_blas_thread
 from pipeline.studies.register import solving
 from pipeline.studies.register.both_ways import both_ways, mirrored
-from pipeline.studies.register.estimate import Estimate
+from pipeline.studies.register.estimate import PARTNERS, WIDEST, Estimate
 from pipeline.studies.register.geometry import first_frame, inverted, refined_frame
 from pipeline.studies.register.jaws import of_jaw, stand_otherwise, way_of_lower
 from pipeline.studies.register.movement import to_parts, tooth_axes
+from pipeline.studies.register.pictures.matching import pairs_of
 from pipeline.studies.register.uncertainty import RANGE, measured, misfit
-from pipeline.studies.register.visit import Visit, scale_of
+from pipeline.studies.register.visit import Visit, in_frame, scale_of
 
 Array = npt.NDArray[np.float64]
 
@@ -207,6 +208,16 @@ def _compared(
     """
     share = len(agreeing) / len(set(first.centres) & set(second.centres))
     frame = refined_frame(first, second, frame, agreeing)
+    cameras = (
+        [look.camera for look in first.looks],
+        [in_frame(look.camera, frame) for look in second.looks],
+    )
+    if not pairs_of(*cameras, PARTNERS, WIDEST):
+        raise ReconstructionError(
+            f"No photograph of '{second.name}' looks at the teeth from nearly the same side as one "
+            f"of '{first.name}' (within {2 * WIDEST:.0f} degrees), so that they can't be laid over "
+            "each other. Photograph both visits from the same places."
+        )
     there, back = both_ways(first, second, frame, agreeing)
     likeness = min(there.likeness, back.likeness)
     if likeness < LEAST_LIKENESS or share < LEAST_SHARE:
@@ -227,6 +238,8 @@ def _compared(
             for way in (there, back)
         )
         teeth = _teeth(axes, there, back, many)
+    if not teeth:
+        raise ReconstructionError(f"No tooth of '{second.name}' shows enough to be measured by.")
     both = set(first.centres) ^ set(second.centres)
     missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
