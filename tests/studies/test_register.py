@@ -178,6 +178,17 @@ def test_with_many_photographs_a_tooth_that_one_way_alone_finds_is_not_measured(
     assert 23 in many.missing
 
 
+def test_a_tooth_with_another_number_at_the_second_visit_is_measured_or_missing_not_both(
+    found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparing, "both_ways", lambda *_: tuple(ways))
+    teeth = {n if n != 11 else 18: points for n, points in found.second.teeth.items()}
+    second = Visit("second", found.second.looks, teeth)
+    again = compare_visits(found.first, second)
+    assert 11 in {tooth.tooth for tooth in again.teeth} and 11 not in again.missing
+    assert 18 in again.missing
+
+
 def test_what_certainly_moved_is_no_reference(
     found: comparing.Comparison, ways: list[Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:

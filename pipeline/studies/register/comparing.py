@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,7 +94,7 @@ class Comparison:
         first, second: the visits.
         first_from_second: [4, 4] similarity of their frames, by the teeth that stood still.
         teeth: what could be measured, by number.
-        missing: teeth that only one of the visits shows well enough.
+        missing: those that could not be, of either visit.
         likeness, share, residual: what the decision that it is one patient stands on: median
             correlation of crowns' surroundings; share of the teeth that agree with one frame;
             median distance of crown from crown, mm.
@@ -182,14 +182,13 @@ def _jaw_by_jaw(first: Visit, second: Visit) -> Comparison:
         raise failures[0]
     main = next(iter(found.values()))
     teeth = sorted((t for one in found.values() for t in one.teeth), key=lambda t: t.tooth)
-    every = set(first.centres) | set(second.centres)
     apart = None
     if len(found) == len(JAWS):
         frames = [one.first_from_second for one in found.values()]
         apart = way_of_lower(first.centres, frames[0], frames[1])
     return replace(
         main, first=first, second=second, teeth=tuple(teeth),
-        missing=tuple(sorted(every - {tooth.tooth for tooth in teeth})),
+        missing=_missing(first, second, teeth),
         likeness=min(one.likeness for one in found.values()),
         share=min(one.share for one in found.values()),
         residual=max(one.residual for one in found.values()),
@@ -240,14 +239,18 @@ def _compared(
         teeth = _teeth(axes, there, back, many)
     if not teeth:
         raise ReconstructionError(f"No tooth of '{second.name}' shows enough to be measured by.")
-    both = set(first.centres) ^ set(second.centres)
-    missing = both | (set(first.centres) - {tooth.tooth for tooth in teeth})
     # By surfaces, not by cameras: what a camera's distance is off, its focal length makes good.
     joint = refined_frame(first, second, frame, there.still)
     return Comparison(
-        first, second, joint, tuple(teeth), tuple(sorted(missing)), likeness, share,
+        first, second, joint, tuple(teeth), _missing(first, second, teeth), likeness, share,
         max(there.residual, back.residual), None, "", scale_of(joint), 1.0,
     )  # fmt: skip
+
+
+def _missing(first: Visit, second: Visit, teeth: Sequence[Moved]) -> tuple[int, ...]:
+    """Numbers of the teeth of both visits that none of `teeth` is."""
+    every = set(first.centres) | set(second.centres)
+    return tuple(sorted(every - {tooth.tooth for tooth in teeth}))
 
 
 def halves(
