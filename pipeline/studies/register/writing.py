@@ -54,7 +54,8 @@ def warning(found: Comparison) -> str:
     elif found.jaws:
         said.append(
             "The jaws do not stand to each other as they did at the first visit, and only the "
-            f"{found.jaws[0]} one can be compared: the teeth of the other are not measured."
+            f"{found.jaws[0]} one can be compared: the crowns of the other are too few, or do not "
+            "agree well enough, and are not measured."
         )
     return " ".join([*said, *filter(None, [warning_of(found.first, found.second)])])
 
