@@ -19,7 +19,8 @@ from pipeline.studies.register.visit import Visit
 
 Array = npt.NDArray[np.float64]
 
-#: Jaws that meet as they did come out within this of each other, mm.
+#: Jaws that meet as they did come out within this of each other, mm: at .2 to .44 in five pairs of
+#: visits of generated mouths, four of them of three photographs.
 FARTHEST = 1.0
 
 
