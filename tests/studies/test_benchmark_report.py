@@ -127,6 +127,10 @@ def test_the_mean_of_the_scenes_that_did_not_fail_is_not_the_best() -> None:
     rows = [["Ours", "27.00 ± 4.24 (n=2)"], ["Rival", "29.00 (1 of 2 failed)"], ["Other", "26.00"]]
     grid = {"title": "T", "caption": "c", "columns": ["Method", "PSNR, 3 views"], "rows": rows}
     assert [row[1].best for row in grid_table(grid)["table"].rows] == [True, False, False]
+    harder = [{**cell(m, 3, psnr), "scene": "b"} for m, psnr in (("ours", 20.0), ("rival", None))]
+    found = results([cell("ours", 3, 25.0), cell("rival", 3, 24.0), *harder])
+    for chart in charts(found, found["tables"][0], {"ours": "Ours", "rival": "Rival"}):
+        assert "Without the scenes that failed: Rival at 3 views." in chart.caption
 
 
 def test_charts_have_the_papers_figures_where_it_scored_so() -> None:

@@ -194,7 +194,7 @@ def charts(
         quoted = _paper_values(table, papers, scoring, views, "psnr")
         yield _chart(
             _titled(_values(table, scoring, "psnr"), titles), _titled(quoted, titles), views,
-            "PSNR, dB", f"PSNR of {SCORINGS[scoring]}",
+            "PSNR, dB", f"PSNR of {SCORINGS[scoring]}", _partial(table, scoring, "psnr", titles),
         )  # fmt: skip
     seconds = _values(table, "cost", "seconds")
     if any(seconds.values()):
@@ -202,13 +202,14 @@ def charts(
         quoted = _paper_values(table, papers, scoring, views, "seconds")
         yield _chart(
             _titled(seconds, titles), _titled(quoted, titles), views, "seconds",
-            "Seconds from the photographs to the scene", log=True,
+            "Seconds from the photographs to the scene",
+            _partial(table, "cost", "seconds", titles), log=True,
         )  # fmt: skip
 
 
 def _chart(
     ours: Mapping[str, Mapping[float, float]], paper: Mapping[str, Mapping[float, float]],
-    views: Sequence[int], label: str, title: str, *, log: bool = False,
+    views: Sequence[int], label: str, title: str, partial: str, *, log: bool = False,
 ) -> Chart:  # fmt: skip
     said = "; ".join(
         f"{name}: " + ", ".join(f"{value:.2f} at {k:g} views" for k, value in sorted(v.items()))
@@ -216,6 +217,7 @@ def _chart(
     )  # fmt: skip
     told = "Dashed" if len(views) > 1 else "Orange mark"
     caption = f"{title}. {told}: the paper's, on other data." if paper else f"{title}."
+    caption += partial
     if len(views) > 1:
         return series_chart(
             ours, ("input views", label), f"{title}. {said}.", caption, paper, log=log
@@ -237,6 +239,19 @@ def _values(table: Mapping[str, Any], scoring: str, figure: str) -> dict[str, di
             if entry["mean"] is not None:
                 values[entry["views"]] = float(entry["mean"])
     return found
+
+
+def _partial(
+    table: Mapping[str, Any], scoring: str, figure: str, titles: Mapping[str, str]
+) -> str:  # fmt: skip
+    """Which entries of a chart are means without the scenes that failed; mostly none."""
+    found = [
+        f"{titles.get(entry['method'], entry['method'])} at {entry['views']} views"
+        for entry in table["figures"]
+        if (entry["scoring"], entry["figure"]) == (scoring, figure)
+        and entry["failed"] and entry["mean"] is not None
+    ]  # fmt: skip
+    return f" Without the scenes that failed: {', '.join(found)}." if found else ""
 
 
 def _paper_values(
