@@ -22,6 +22,7 @@ from pipeline.store import Store
 from pipeline.studies.register import comparing, run_register, solving
 from pipeline.studies.register.page.writing import tinted
 from pipeline.studies.register.visit import Visit, names_of, read_visit, warning_of
+from pipeline.workspace import StageStatus
 from tests.browser import needs_chromium, run_in
 from tests.studies.register_case import MOVED, toy_motions, toy_visit, write_visit
 from tests.studies.report_case import write_result
@@ -175,6 +176,31 @@ def test_photographs_that_can_not_be_read_again_are_named() -> None:
     visit = replace(toy_visit("first"), lost=("a.jpg", "b.jpg"))
     said = warning_of(visit, toy_visit("second"))
     assert said.startswith("a.jpg, b.jpg of 'first' can't be read where the run read them")
+
+
+def test_teeth_that_were_put_right_since_the_run_are_said_not_to_count(
+    workspaces: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refusal sends people to check.html; without another run what they say there counts for
+    nothing, and the old numbers were compared without a word."""
+    from pipeline.studies.report import reading
+
+    def changed(**_: Any) -> list[StageStatus]:
+        why = ["input file added: teeth.yaml", "library numpy 1 → 2"]
+        states = {"init": ("stale", why), "fit": ("pending", ["depends on init"])}
+        return [
+            StageStatus(name, *states.get(name, ("cached", [])))
+            for name in ("views", "teeth", "init", "fit")
+        ]
+
+    monkeypatch.setattr(reading, "status", changed)
+    visit = read_visit(workspaces[0])
+    assert visit.changed == ("input file added: teeth.yaml",)
+    said = warning_of(toy_visit("second"), replace(visit, name="may"))
+    assert said == (
+        "'may' was run before this: input file added: teeth.yaml. It is not in the figures. Run "
+        "the pipeline there again first."
+    )
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_the_work(

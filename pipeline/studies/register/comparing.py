@@ -226,7 +226,8 @@ def _compared(
             f"({100 * share:.0f} %, at least {100 * LEAST_SHARE:.0f} % are needed), and laid over "
             f"each other the crowns' surfaces agree with a correlation of {likeness:.2f} (at least "
             f"{LEAST_LIKENESS} is needed). Nothing was written. If they are of one patient, look "
-            "at check.html of both workspaces: a wrong tooth number is the usual cause."
+            "at check.html of both workspaces: a wrong tooth number is the usual cause. Put right, "
+            "it counts once the pipeline has run there again."
         )
     many = min(len(first.looks), len(second.looks)) >= MANY
     teeth = _teeth(axes, there, back, many)

@@ -19,6 +19,7 @@ from pipeline.artifacts.gaussians import Gaussians
 from pipeline.artifacts.space.scale import UNSAID_PERCENT
 from pipeline.errors import RequestError
 from pipeline.geometry.world import move_camera
+from pipeline.pages.case import Case
 from pipeline.store import Store
 from pipeline.studies.register.pictures.hardware import painted_over
 from pipeline.studies.register.pictures.originals import larger_photographs
@@ -128,6 +129,7 @@ class Visit:
         files: hash -> name of each file that its photographs were read from.
         labels: how pages call its photographs, by their names.
         lost: files of photographs that have more pixels, and are not as the run read them.
+        changed: what of its files has changed since the run, in words, such as a `teeth.yaml`.
     """
 
     name: str
@@ -141,6 +143,7 @@ class Visit:
     files: Mapping[str, str] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
     lost: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
 
     @property
     def scale_doubt(self) -> float:
@@ -238,7 +241,7 @@ def read_visit(workspace: Path) -> Visit:
     files = {hashed: name for name, hashed in read_from if not name.startswith(MASK_PREFIX)}
     made = Visit(
         workspace.resolve().name, tuple(looks), points, 1.0, "", gaussians, files=files,
-        labels=case.labels, lost=lost,
+        labels=case.labels, lost=lost, changed=_changed(case),
     )  # fmt: skip
     made = made.in_frame(frame)
     made = without_braces(made, pictures)
@@ -259,9 +262,15 @@ def warning_of(first: Visit, second: Visit) -> str:
     """What has to be known of the photographs of two visits; mostly nothing.
 
     Of photographs that both hold it comes out that nothing moved. Of such as can't be read again
-    turns are measured in the smaller pictures of the run.
+    turns are measured in the smaller pictures of the run. What a person has put right since a run
+    is not in it.
     """
-    said = []
+    said = [
+        f"'{visit.name}' was run before this: {'; '.join(visit.changed)}. It is not in the "
+        "figures. Run the pipeline there again first."
+        for visit in (first, second)
+        if visit.changed
+    ]
     shared = [name for hashed, name in first.files.items() if hashed in second.files]
     if shared:
         said.append(
@@ -275,6 +284,14 @@ def warning_of(first: Visit, second: Visit) -> str:
         if visit.lost
     ]
     return " ".join(said)
+
+
+def _changed(case: Case) -> tuple[str, ...]:
+    """What of the files of a scene has changed since it was made."""
+    made = case.by_name[case.providers("gaussians")[-1]]
+    until = case.stages[: case.stages.index(made) + 1]
+    reasons = (r for stage in until if stage.state == "stale" for r in stage.reasons)
+    return tuple(dict.fromkeys(r for r in reasons if r.startswith("input file")))
 
 
 def _some(names: Sequence[str]) -> str:
