@@ -307,23 +307,33 @@ def _expand_folder(folder: Path, tell: Callable[[str], None]) -> list[Path]:
 def _tell_of_others(
     folder: Path, entries: Sequence[Entry], read: set[str], tell: Callable[[str], None]
 ) -> None:
-    """Say which pictures of a folder are in formats that are not read, but for those that lie there
-    in another format too, as cameras write both.
+    """Say which pictures of a folder are in formats that are not read, and which films are not, but
+    for those that lie there as a photograph too, as cameras and phones write both.
 
     Args:
         read: stems of the photographs that are taken.
     """
-    others = [
-        printable(entry.path.name) for entry in entries
-        if entry.path.suffix.lower() in OTHER_PICTURES
-        and not entry.is_folder and entry.path.stem not in read
-    ]  # fmt: skip
-    if others:
+
+    def left_out(suffixes: Sequence[str]) -> list[Path]:
+        files = [entry.path for entry in entries if not entry.is_folder]
+        return [p for p in files if p.suffix.lower() in suffixes and p.stem not in read]
+
+    if others := left_out(OTHER_PICTURES):
         them = "it" if len(others) == 1 else "them"
         tell(
-            f"{', '.join(others[:3])}{', ...' if others[3:] else ''} in {folder}: left out, for "
-            f"photographs are read as {KNOWN}. To use {them} too, save {them} as JPEG."
+            f"{_some(others)} in {folder}: left out, for photographs are read as {KNOWN}. To use "
+            f"{them} too, save {them} as JPEG."
         )
+    if films := left_out(VIDEO_SUFFIXES):
+        tell(
+            f"{_some(films)} in {folder}: left out, for a case is either one video or a set of "
+            f"photographs. To use the video instead, name it: {films[0]}"
+        )
+
+
+def _some(files: Sequence[Path]) -> str:
+    names = ", ".join(printable(path.name) for path in files[:3])
+    return names + (", ..." if files[3:] else "")
 
 
 def _try_list(folder: Path) -> list[Entry]:

@@ -329,3 +329,13 @@ def test_pictures_in_other_formats_are_not_passed_by_without_a_word(tmp_path: Pa
     assert list(find_images([tmp_path], told.append)) == ["front.jpg", "right.jfif"]
     (note,) = told
     assert note.startswith(f"left.AVIF in {tmp_path}: left out") and "save it as JPEG" in note
+
+
+def test_a_film_beside_photographs_is_not_passed_by_without_a_word(tmp_path: Path) -> None:
+    for name in ("1.jpg", "2.jpg", "2.MOV", "sweep.mp4"):  # phones write a film beside a photograph
+        (tmp_path / name).touch()
+    told: list[str] = []
+    assert list(find_images([tmp_path], told.append)) == ["1.jpg", "2.jpg"]
+    (note,) = told
+    assert note.startswith(f"sweep.mp4 in {tmp_path}: left out")
+    assert note.endswith(f"name it: {tmp_path / 'sweep.mp4'}")
