@@ -335,6 +335,18 @@ def test_the_names_that_fit_most_photographs_count():
         matching_cameras([*by_view, KnownCamera("b/000.jpg", lens, pose)], views)
 
 
+def test_cameras_of_all_frames_are_not_those_of_some():
+    """Every third frame of a film, and the cameras of all of its frames."""
+    pose, image = np.eye(4), np.zeros((3, 4, 3), np.float32)
+    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
+    every = [KnownCamera(f"frames/{k:03d}.png", lens, pose) for k in range(24)]
+    views = [View(f"{k:03d}", image, source_name=f"film.mp4#{3 * k}") for k in range(8)]
+    with pytest.raises(RequestError, match=r"fewer than two .* no photograph has the number 008"):
+        matching_cameras(every, views)
+    found = matching_cameras(every[:5], views)  # what we exported, where some were not placed
+    assert sorted(found) == ["000", "001", "002", "003", "004"]
+
+
 def test_photographs_held_out_do_not_say_which_names_count():
     """Of a film 003 is held out: what is exported as 003 shows 004."""
     pose, image = np.eye(4), np.zeros((3, 4, 3), np.float32)

@@ -180,8 +180,10 @@ def matching_cameras(
 ) -> dict[str, KnownCamera]:  # fmt: skip
     """Name of a view -> its camera: by the name of the source file, with or without suffix.
 
-    Models that we exported have the names of views. Of all these ways the one that finds most
-    cameras holds, so that photographs 000, 005, 010 are not taken for views of these names.
+    Models that we exported have the names of views, and no others: a model of all frames of a film
+    (000, 001, ...) is none of ours where only some of them are views. Of all these ways the one
+    that finds most cameras holds, so that photographs 000, 005, 010 are not taken for views of
+    these names.
 
     Args:
         cameras: of the model.
@@ -202,6 +204,8 @@ def matching_cameras(
         (lambda view: PurePath(view.source_name).stem, lambda name: _path(name).stem),
         (lambda view: view.name, lambda name: _path(name).stem),  # a model that we exported
     )
+    foreign = sorted({_path(camera.name).stem for camera in cameras} - counted)
+    schemes = schemes[:-1] if foreign else schemes
     best: dict[str, list[KnownCamera]] = {}
     most = (0, 0)
     for name_of_view, name_of_camera in schemes:
@@ -231,6 +235,18 @@ def matching_cameras(
     raise RequestError(
         f"{setting}: none of the {len(views)} photographs has a camera there. The names there are "
         f"like {cameras[0].name}, the photographs' like {views[0].source_name or views[0].name}."
+        f"{_numbers_only(foreign, counted, cameras)}"
+    )
+
+
+def _numbers_only(foreign: list[str], names: set[str], cameras: list[KnownCamera]) -> str:
+    """Of a model whose names would be those of views, if it had no others: a sentence."""
+    if not foreign or len({_path(camera.name).stem for camera in cameras} & names) < 2:
+        return ""
+    return (
+        f" The numbers of the photographs as they were read ({', '.join(sorted(names)[:3])}, ...) "
+        f"are not meant by these names, for no photograph has the number {foreign[0]}: give the "
+        "photographs under the names that the model has."
     )
 
 
