@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import PurePath
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +16,27 @@ Array = npt.NDArray[np.float64]
 
 
 def photo_named(views: Views, name: str) -> View:
-    """The photograph that the user means.
+    """The photograph that the user means: by its file's name, by that without suffix, or, where no
+    file is so called, by the name of its view.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is none, or several are called so.
     """
-    names = {view.source_name: view for view in views.views}
-    names |= {Path(view.source_name).stem: view for view in views.views} | views.by_name() | names
-    if name not in names:
+    ways: tuple[Callable[[View], str], ...] = (
+        lambda view: view.source_name,
+        lambda view: PurePath(view.source_name).stem,
+        lambda view: view.name,
+    )
+    found = next(filter(None, ([v for v in views.views if way(v) == name] for way in ways)), [])
+    if len(found) == 1:
+        return found[0]
+    if found:
         raise RequestError(
-            f"init.length.photo: there is no photograph '{name}'.{nearest(name, names)}"
+            f"init.length.photo: {len(found)} photographs are called '{name}' "
+            f"({', '.join(view.source_name for view in found[:3])}). Give one whole name."
         )
-    return names[name]
+    names = [way(view) for way in ways for view in views.views]
+    raise RequestError(f"init.length.photo: there is no photograph '{name}'.{nearest(name, names)}")
 
 
 #: How far from the true spot people click, in pixels of the working image (standard deviation

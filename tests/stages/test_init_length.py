@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.cameras import Camera
-from pipeline.artifacts.views import View
+from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError
-from stages.init.scale import mm_per_unit
+from stages.init.scale import mm_per_unit, photo_named
 from stages.init.write import place_in
 
 
@@ -26,6 +26,19 @@ def test_length_that_cannot_be_measured_is_refused():
         mm_per_unit(view, camera, 0 * depth, (100, 100), (300, 100), 8.0)
     with pytest.raises(RequestError, match="the same place"):
         mm_per_unit(view, camera, depth, (100, 100), (100, 100), 8.0)
+
+
+def test_the_photograph_of_a_length_is_the_one_whose_file_is_called_so() -> None:
+    """Every second photograph of a series, whose numbers are those of other views."""
+    image = np.zeros((3, 4, 3), np.float32)
+    named = ["000.png", "002.png", "004.png", "film.mp4#0", "film.mp4#7"]
+    views = Views(tuple(View(f"{k:03d}", image, source_name=n) for k, n in enumerate(named)))
+    found = {name: photo_named(views, name).source_name for name in (*named, "002", "003")}
+    assert found == {name: name for name in named} | {"002": "002.png", "003": "film.mp4#0"}
+    with pytest.raises(RequestError, match=r"2 photographs are called 'film' \(film\.mp4#0, "):
+        photo_named(views, "film")
+    with pytest.raises(RequestError, match=r"there is no photograph '04\.png'. Did you mean '004"):
+        photo_named(views, "04.png")
 
 
 def test_a_length_is_of_the_photograph_before_its_lens_was_taken_out() -> None:
