@@ -22,6 +22,7 @@ from pipeline.geometry.models.known_cameras import (
     model_files,
     read_cameras,
 )
+from pipeline.geometry.world import move_camera
 from pipeline.stage import LocalContext
 from stages.init.place import place_known
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
@@ -364,10 +365,16 @@ def test_photographs_held_out_do_not_say_which_names_count():
     assert found["004"].name == ".\\images\\005.jpg" and "h000" in found
 
 
-def test_tracks_are_triangulated_and_wrong_matches_dropped():
+@pytest.mark.parametrize(("size", "away"), [(1.0, 0.0), (50.0, 5e6), (1e-6, 0.0)])
+def test_tracks_are_triangulated_and_wrong_matches_dropped(size, away):
+    """Around the origin, in metres of a map, and in units of which the scene is a millionth."""
     rng = np.random.default_rng(1)
-    cameras = [Camera(str(k), 400, 400, 500, 500, 200, 200, look_at(15 * k)) for k in range(3)]
-    truth = rng.uniform(-0.6, 0.6, (60, 3))
+    motion = size, np.eye(3), np.array([away, -away, 0])
+    cameras = [
+        move_camera(Camera(str(k), 400, 400, 500, 500, 200, 200, look_at(15 * k)), motion)
+        for k in range(3)
+    ]
+    truth = size * rng.uniform(-0.6, 0.6, (60, 3)) + motion[2]
     pixels = [camera.project(truth)[0] for camera in cameras]
     matches = {}
     for i, j in ((0, 1), (1, 2), (0, 2)):
@@ -385,7 +392,7 @@ def test_tracks_are_triangulated_and_wrong_matches_dropped():
     points, kept = triangulate(cameras, tracks, 1.0, 1.0)
     assert len(points) >= 50
     nearest = np.linalg.norm(points[:, None] - truth[None], axis=-1).min(1)
-    assert np.mean(nearest < 1e-6) > 0.9
+    assert np.mean(nearest < 1e-6 * size + 1e-14 * away) > 0.9
     for number, camera in enumerate(cameras):
         mine = kept.view == number
         assert np.abs(camera.project(points[kept.point[mine]])[0] - kept.pixel[mine]).max() < 1

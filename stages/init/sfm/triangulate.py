@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.geometry.graph import Pair
+from pipeline.geometry.world import move_camera
 from stages.init.sfm.matching.epipolar import fundamental_between, sampson_distance
 from stages.init.sfm.matching.two_view import Correspondences
 
@@ -100,6 +101,7 @@ def triangulate(
         points [P, 3] in the world, and the observations of each that were kept.
     """
     tracks = _of_several(tracks)
+    cameras, scale, middle = _near_origin(cameras)
     for _ in range(2):
         points = _intersections(cameras, tracks)
         fits = _errors(cameras, tracks, points) < max_error
@@ -112,7 +114,18 @@ def triangulate(
     kept &= wide
     number = np.cumsum(kept) - 1
     tracks = tracks[kept[tracks.point]]
-    return points[kept], Tracks(number[tracks.point], tracks.view, tracks.pixel)
+    return points[kept] / scale + middle, Tracks(number[tracks.point], tracks.view, tracks.pixel)
+
+
+def _near_origin(cameras: list[Camera]) -> tuple[list[Camera], float, Array]:
+    """The cameras around the origin, at a distance of about 1, and (scale, middle [3]) of
+    new = scale (old - middle): squares of a map's coordinates leave nothing of a scene."""
+    centres = np.array([camera.centre for camera in cameras])
+    middle = centres.mean(0)
+    spread = float(np.linalg.norm(centres - middle, axis=1).mean())
+    scale = 1 / spread if spread > 0 else 1.0
+    motion = scale, np.eye(3), -scale * middle
+    return [move_camera(camera, motion) for camera in cameras], scale, middle
 
 
 def _of_several(tracks: Tracks) -> Tracks:
