@@ -304,67 +304,6 @@ def test_photographs_without_camera_are_named(tmp_path):
     assert sorted(found) == ["001", "002"]
 
 
-def test_the_names_that_fit_most_photographs_count():
-    """Every fifth image of a film, whose names are those of other views."""
-    pose = np.eye(4)
-    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
-    image = np.zeros((3, 4, 3), np.float32)
-    views = [View(f"{k:03d}", image, source_name=f"{5 * k:03d}.png") for k in range(12)]
-    by_source = [KnownCamera(f"images/{5 * k:03d}.jpg", lens, pose) for k in range(12)]
-    by_view = [KnownCamera(f"{k:03d}.png", lens, pose) for k in range(12)]
-    found = matching_cameras(by_source, views)
-    assert {name: known.name for name, known in found.items()} == {
-        f"{k:03d}": f"images/{5 * k:03d}.jpg" for k in range(12)
-    }
-    found = matching_cameras(by_view, views)
-    assert {name: known.name for name, known in found.items()} == {
-        f"{k:03d}": f"{k:03d}.png" for k in range(12)
-    }
-    both = matching_cameras(by_view[:3], [views[0], views[1], views[2]])
-    assert {name: known.name for name, known in both.items()} == {
-        name: f"{name}.png" for name in ("000", "001", "002")
-    }
-    two_ways = [
-        View("001", image, source_name="000.png"),
-        View("000", image, source_name="001.png"),
-    ]
-    found = matching_cameras(by_view, two_ways)
-    assert {name: known.name for name, known in found.items()} == {
-        "001": "000.png", "000": "001.png"
-    }, "of equally many, the names of the files count"  # fmt: skip
-    with pytest.raises(RequestError, match="2 cameras fit one photograph"):
-        matching_cameras([*by_view, KnownCamera("b/000.jpg", lens, pose)], views)
-
-
-def test_cameras_of_all_frames_are_not_those_of_some():
-    """Every third frame of a film, and the cameras of all of its frames."""
-    pose, image = np.eye(4), np.zeros((3, 4, 3), np.float32)
-    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
-    every = [KnownCamera(f"frames/{k:03d}.png", lens, pose) for k in range(24)]
-    views = [View(f"{k:03d}", image, source_name=f"film.mp4#{3 * k}") for k in range(8)]
-    with pytest.raises(RequestError, match=r"fewer than two .* no photograph has the number 008"):
-        matching_cameras(every, views)
-    found = matching_cameras(every[:5], views)  # what we exported, where some were not placed
-    assert sorted(found) == ["000", "001", "002", "003", "004"]
-
-
-def test_photographs_held_out_do_not_say_which_names_count():
-    """Of a film 003 is held out: what is exported as 003 shows 004."""
-    pose, image = np.eye(4), np.zeros((3, 4, 3), np.float32)
-    lens = pycolmap.Camera(model="PINHOLE", width=4, height=3, params=[4, 4, 2, 1.5])
-    exported = [KnownCamera(f"{k:03d}.png", lens, pose) for k in range(5)]
-    inputs = [n for n in range(6) if n != 3]
-    views = [View(f"{k:03d}", image, source_name=f"{n:03d}.jpg") for k, n in enumerate(inputs)]
-    held = [View("h000", image, source_name="003.jpg")]
-    found = matching_cameras(exported, views, "cameras", held)
-    assert {name: known.name for name, known in found.items()} == {
-        f"{k:03d}": f"{k:03d}.png" for k in range(5)
-    }
-    named = [KnownCamera(f".\\images\\{n:03d}.jpg", lens, pose) for n in range(6)]  # of Windows
-    found = matching_cameras(named, views, "cameras", held)
-    assert found["004"].name == ".\\images\\005.jpg" and "h000" in found
-
-
 @pytest.mark.parametrize(("size", "away"), [(1.0, 0.0), (50.0, 5e6), (1e-6, 0.0)])
 def test_tracks_are_triangulated_and_wrong_matches_dropped(size, away):
     """Around the origin, in metres of a map, and in units of which the scene is a millionth."""

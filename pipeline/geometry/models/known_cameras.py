@@ -364,19 +364,25 @@ def rounded(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
 
 
 def working_pixels_from_lens(view: View, known: KnownCamera, setting: str) -> Array:
-    """[3, 3] affine map from the pixels of the model's image to the view's."""
+    """[3, 3] affine map from the pixels of the model's image to the view's.
+
+    Of a photograph that is stored as a mirror image (and whose file says so) the lens can only be
+    that of the upright picture: a camera of the stored one sees a world that is mirrored too.
+    """
     lens = known.lens
     width, height = view.source_size if min(view.source_size) > 0 else (view.width, view.height)
     upright = view.upright_size
     shape = lens.width / lens.height
-    if abs(np.log(shape * height / width)) < 0.02:
+    mirrored = (np.linalg.det(view.working_from_source[:2, :2]) < 0) != view.turned_over
+    if abs(np.log(shape * height / width)) < 0.02 and not mirrored:
         scale = np.diag([width / lens.width, height / lens.height, 1.0])
         return np.asarray(view.working_from_source @ scale)
     if abs(np.log(shape * upright[1] / upright[0])) < 0.02:
         scale = np.diag([upright[0] / lens.width, upright[1] / lens.height, 1.0])
         return np.asarray(view.working_from_upright @ scale)
+    how = " and is stored as a mirror image" if mirrored else ""
     raise RequestError(
         f"{setting}: the camera of {known.name} is for an image of {lens.width} x {lens.height} "
-        f"pixels, but the photograph {view.source_name or view.name} has {width} x {height}. Give "
-        "the photographs that the cameras were made from."
+        f"pixels, but the photograph {view.source_name or view.name} has {width} x {height}{how}. "
+        "Give the photographs that the cameras were made from."
     )
