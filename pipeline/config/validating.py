@@ -121,6 +121,8 @@ def _explain(model: type[BaseModel], section: str, error: Any) -> str:
         )
     about = _description(model, location)
     given = error.get("input")
+    if isinstance(given, dict) and error["type"] not in _MAY_BE and _fields_at(model, location):
+        return f"{dotted}: {why}.{f' It means: {about}' if about else ''}"  # settings together
     hint = ""
     if isinstance(given, str) and why.startswith("Input should be '"):
         hint = nearest(given, re.findall("'([^']*)'", why))

@@ -164,6 +164,7 @@ def test_aliases_stand_for_what_they_name(tmp_path: Path) -> None:
         ("init.max_reprojection_error=0.01", "init.max_reprojection_error=0.01 is not allowed"),
         ("init.dense.window=4", "is not allowed: a window with a pixel in its middle is odd"),
         ("init.dense.polish_window=30", "is not allowed: a window with a pixel in its middle"),
+        ("init.length.mm=8", "init.length: it needs init.length.photo, "),  # no {'mm': 8}
     ],
 )
 def test_a_setting_that_is_not_understood_is_refused(text: str, words: str) -> None:
