@@ -283,10 +283,11 @@ def _checked(pair, by_name):  # type: ignore[no-untyped-def]
     for name, confidence in ((pair.name_i, pair.confidence_i), (pair.name_j, pair.confidence_j)):
         view = by_name[name]
         if confidence.shape != (view.height, view.width):
+            both = [by_name[n].source_name or n for n in (pair.name_i, pair.name_j)]
             raise RequestError(
-                f"The pointmap of the pair {pair.name_i}, {pair.name_j} has "
-                f"{confidence.shape[1]}x{confidence.shape[0]} pixels for view {name}, whose image "
-                f"is {view.width}x{view.height}. Give pointmaps at the working size, or set "
-                "views.long_side to theirs."
+                f"The pointmap of the pair {both[0]}, {both[1]} has "
+                f"{confidence.shape[1]}x{confidence.shape[0]} pixels for "
+                f"{view.source_name or name}, whose image is {view.width}x{view.height}. Give "
+                "pointmaps at the working size, or set views.long_side to theirs."
             )
     return pair

@@ -158,7 +158,7 @@ def _run(context: StageContext) -> None:
     for (view_i, view_j, angle), (forward, backward) in zip(pairs, found, strict=True):
         share = 0.5 * float(forward.mask.mean() + backward.mask.mean())
         if share < _POOR_SHARE and not angle > _NEAR:
-            poor.append(f"{view_i.name} and {view_j.name} ({share:.0%})")
+            poor.append(f"{_title(view_i)} and {_title(view_j)} ({share:.0%})")
         shares.append(share)
         deviations += [forward.deviation, backward.deviation]
         results.append(
@@ -169,7 +169,7 @@ def _run(context: StageContext) -> None:
         )  # fmt: skip
     if poor:
         context.warn(
-            "Flow can be trusted on few pixels, and hardly contributes to the fit, between views "
+            "Flow can be trusted on few pixels, and hardly contributes to the fit, between "
             f"{', '.join(poor)}."
         )
     context.save(Flow(tuple(sorted(results, key=lambda pair: (pair.name_i, pair.name_j)))))
@@ -183,6 +183,11 @@ def _run(context: StageContext) -> None:
     if compared.size:
         figures["median_px_from_geometry"] = round(float(np.median(compared)), 3)
     context.summarize(**figures)
+
+
+def _title(view: View) -> str:
+    """How the user knows a photograph."""
+    return view.source_name or view.name
 
 
 def _cameras_of(views: Views, placed: Cameras | None) -> dict[str, Camera]:
@@ -224,7 +229,7 @@ def _choose_pairs(
         if angle <= config.max_angle:
             pairs.append((view_i, view_j, angle))
         else:
-            too_wide.append((view_i.name, view_j.name, angle))
+            too_wide.append((_title(view_i), _title(view_j), angle))
     return pairs, too_wide
 
 

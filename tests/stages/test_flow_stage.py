@@ -184,11 +184,15 @@ def mostly_masked(shots: list[Shot]) -> list[Shot]:
 
 
 def test_flow_between_near_views_that_cannot_be_trusted_is_said(tmp_path: Path) -> None:
-    """Once, however many pairs there are: films have dozens."""
-    local = context(tmp_path, mostly_masked(shoot(-8, 0, 8, width=64, height=48)))
+    """Once, however many pairs there are: films have dozens. By the names of the photographs."""
+    shots = mostly_masked(shoot(-8, 0, 8, width=64, height=48))
+    named = [
+        (c, replace(v, source_name=f"film.mp4#{5 * k}"), d) for k, (c, v, d) in enumerate(shots)
+    ]
+    local = context(tmp_path, named)
     run(local)
     (said,) = local.warnings
-    assert "000 and 001 (" in said and "001 and 002 (" in said
+    assert "film.mp4#0 and film.mp4#5 (" in said and "film.mp4#5 and film.mp4#10 (" in said
 
 
 def test_prewarp_without_geometry_is_refused(tmp_path: Path) -> None:
