@@ -203,11 +203,20 @@ def place_known(
     wrong = _contradicted(matches, chosen)
     few = sum(len(those) >= LEAST_POINTS for those in seen) < 2
     if few or len(wrong) >= len(placed) - 1:
+        number = sum(int(those.coherent.sum()) for those in matches.values())
+        agreeing = sum(len(those) for those in chosen.values())
+        if agreeing > LEAST_AGREEMENT * number:
+            raise ReconstructionError(
+                f"The cameras given tell no depth: {agreeing} of {number} matches lie where they "
+                f"say, but {len(points)} of their points are seen from two places that are "
+                f"{options.min_tri_angle:g}° apart (init.min_tri_angle). Do all cameras stand in "
+                f"one place? {HOW_TO_SHOOT}"
+            )
         raise ReconstructionError(
-            "The cameras given do not fit the photographs: of "
-            f"{sum(int(those.coherent.sum()) for those in matches.values())} matches "
-            f"{sum(len(those) for those in chosen.values())} lie where the cameras say. Are they "
-            f"the cameras of these photographs, at this zoom? {HOW_TO_SHOOT}"
+            f"The cameras given do not fit the photographs: of {number} matches {agreeing} lie "
+            "where the cameras say. Are they the cameras of these photographs, at this zoom, with "
+            "the axes of their format (a transforms.json has camera-to-world matrices, y up and z "
+            f"back)? {HOW_TO_SHOOT}"
         )
     if wrong:
         warn(

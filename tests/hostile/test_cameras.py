@@ -121,7 +121,7 @@ FRAME = "frame 1 ('1.jpg')"
         (frame(transform_matrix=[[1, 2, 3, 4]] * 5), "of shape 5x4"),
         (frame(transform_matrix=[1, 2, 3, 4]), "of shape 4x0"),
         (frame(transform_matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]),
-         "whose last row is a list"),
+         "whose last row is 0 0 0 2 in frame"),
         (frame(file_path=3), "has a frame 1 whose file_path is 3"),
         (frame(file_path=""), "has a frame 1 whose file_path is ''"),
         (frame(file_path=None), "whose file_path is None"),

@@ -255,17 +255,18 @@ def test_wrong_cameras_are_refused_in_words(tmp_path):
         InitStage().sources(InitConfig(method="known"), {})
 
 
-def test_cameras_of_other_photographs_are_noticed(tmp_path):
-    """The names fit, but the poses are another scene's."""
+@pytest.mark.parametrize(
+    ("yaws", "words"),
+    [((50, 170, 290), "do not fit the photographs"), ((50, 50, 50), "tell no depth: .* one place")],
+)
+def test_cameras_of_other_photographs_are_noticed(tmp_path, yaws, words):
+    """The names fit, but the poses are another scene's, or are all the same."""
     folder = colmap_model(tmp_path / "model")
-    cameras, _ = read_cameras(model_files(folder).values())
     shuffled = pycolmap.Reconstruction(str(folder))
-    for number, camera in enumerate(cameras):
-        turned = pycolmap.Rigid3d(look_at(120 * number + 50, 60)[:3])
-        shuffled.images[number + 1].frame.rig_from_world = turned
-        assert camera.name
+    for number, yaw in enumerate(yaws):
+        shuffled.images[number + 1].frame.rig_from_world = pycolmap.Rigid3d(look_at(yaw, 60)[:3])
     shuffled.write_text(str(folder))
-    with pytest.raises(ReconstructionError, match="do not fit the photographs"):
+    with pytest.raises(ReconstructionError, match=words):
         run(tmp_path / "out", folder)
 
 

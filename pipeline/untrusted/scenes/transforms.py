@@ -180,8 +180,9 @@ def _matrix(value: object, where: str) -> Array:
                 )
     matrix = np.array([*rows[:3], [0, 0, 0, 1]], np.float64)
     if rows[3:] and not np.allclose(rows[3], [0, 0, 0, 1], atol=1e-6):
+        last = " ".join(f"{entry:.6g}" for entry in rows[3])
         raise UnusableFile(
-            f"has a transform_matrix whose last row is {_shown(rows[3])} in {where}, not 0 0 0 1"
+            f"has a transform_matrix whose last row is {last} in {where}, not 0 0 0 1"
         )
     return matrix
 
