@@ -34,15 +34,15 @@ def reduce_cloud(
     """Voxel downsampling of well-known points and of low-confidence fill, each by itself.
 
     Both get voxels of `voxel_size` median nearest-neighbour spacings of the well-known points. Of
-    a budget, the fill gets what it would take by itself, but at most `fill_share`; its voxels only
-    grow.
+    a budget, the fill gets what it would take by itself, but at most `fill_share`, or what the
+    well-known points leave if that is more; its voxels only grow.
 
     Args:
         cloud: N points.
         voxel_size: voxel edge in median spacings; 0: no voxels but those that the budget needs.
         target_points: budget; 0: none.
         fill_confidence: points of no more confidence are fill (completed depth, backdrop).
-        fill_share: largest share of the budget for fill.
+        fill_share: largest share of the budget that fill takes from well-known points.
         threads: of the neighbour search; does not change the result.
 
     Returns:

@@ -46,8 +46,10 @@ class SapConfig(StageConfig):
         description="Points of no more confidence count as fill (backdrop, completed depth).",
     )  # fmt: skip
     fill_share: float = Field(
-        0.15, ge=0, le=1, description="Largest share of target_points that fill may take."
-    )
+        0.15, ge=0, le=1,
+        description="Largest share of target_points that fill may take from well-known points; it "
+        "may have what these leave, too.",
+    )  # fmt: skip
 
 
 class SapStage(Stage):

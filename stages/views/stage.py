@@ -164,7 +164,7 @@ class ViewsStage(Stage):
             )
         if config.frames is not None and len(everything if from_video else loaded) < config.frames:
             context.warn(
-                f"{config.frames} views were asked for, but there are only {len(loaded)}: all of "
+                f"{config.frames} views were asked for, but there are only {len(distinct)}: all of "
                 "them are used."
             )
         for item in (*distinct, *held):
