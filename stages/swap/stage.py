@@ -6,9 +6,9 @@ with ``--set swap.cameras=MODEL``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
@@ -16,9 +16,15 @@ from pipeline.errors import RequestError
 from pipeline.stage import Stage, StageConfig, StageContext, runtime
 from pipeline.untrusted.paths import GivenPath
 
+if TYPE_CHECKING:
+    from pipeline.artifacts.cameras import Camera
+
 SETTING = "swap.cameras"
 #: Distortion of the photographs, in pixels, that is worth a word.
 _BENT = 0.5
+#: Two reconstructions of the same photographs are seldom further apart than this in the median:
+#: degrees, and shares of the largest distance between two cameras.
+_TURNED, _AWAY = 10.0, 0.3
 
 
 class SwapConfig(StageConfig):
@@ -37,7 +43,7 @@ class SwapStage(Stage):
     """cameras of earlier stages -> those of a model, in the same world."""
 
     name: ClassVar[str] = "swap"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     summary: ClassVar[str] = "put a COLMAP model's cameras in place of those of the earlier stages"
     Config: ClassVar[type[StageConfig]] = SwapConfig
     requires: ClassVar[tuple[str, ...]] = ("views", "cameras")
@@ -90,6 +96,14 @@ class SwapStage(Stage):
             )
         motion = similarity_between([given[name] for name in both], [now[name] for name in both])
         moved = {name: move_camera(camera, motion) for name, camera in given.items()}
+        turned, away = _apart([moved[name] for name in both], [now[name] for name in both])
+        if turned > _TURNED or away > _AWAY:
+            context.warn(
+                f"The model's cameras are {turned:.0f}° and {100 * away:.0f} % of their distances "
+                "from those of the earlier stages (median), and are used all the same. Are they "
+                "the cameras of these photographs, with the axes of their format (a "
+                "transforms.json has camera-to-world matrices, y up and z back)?"
+            )
         if not config.lenses:
             moved = {
                 name: replace(now[name], cam_from_world=moved[name].cam_from_world) for name in both
@@ -121,3 +135,17 @@ class SwapStage(Stage):
             )
         )
         context.summarize(views_registered=len(moved), views_total=len(views))
+
+
+def _apart(cameras: Sequence[Camera], others: Sequence[Camera]) -> tuple[float, float]:
+    """How far aligned cameras are from others of the same views: degrees, and share of the largest
+    distance between two of the others; medians."""
+    import numpy as np
+
+    from pipeline.geometry.pose_metrics import centres_of, position_errors, rotation_errors
+
+    found, wanted = (np.stack([c.cam_from_world for c in some]) for some in (cameras, others))
+    centres = centres_of(wanted)
+    largest = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    away = position_errors(found, wanted) / max(largest, 1e-12)
+    return float(np.median(rotation_errors(found, wanted))), float(np.median(away))

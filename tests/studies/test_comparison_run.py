@@ -334,6 +334,17 @@ def test_swap_says_that_it_leaves_distortion_in(tmp_path, model):
     assert swapped(tmp_path / "straight", model, Cameras(tuple(named))).warnings == []
 
 
+def test_swap_says_that_a_models_cameras_are_far_from_those_found(tmp_path):
+    """World-to-camera matrices of OpenCV where a transforms.json has the other way and OpenGL."""
+    named = [replace(c, name=f"{k:03d}") for k, c in enumerate(true_cameras())]
+    told = json.loads((SAMPLES / "transforms.json").read_text())
+    for frame in told["frames"]:
+        frame["transform_matrix"] = frame["w2c_opencv"]
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    far = swapped(tmp_path, tmp_path / "transforms.json", Cameras(tuple(named)))
+    assert len(far.warnings) == 1 and "used all the same" in far.warnings[0]
+
+
 def test_swap_without_cameras_is_refused():
     with pytest.raises(RequestError, match=r"swap\.cameras=PATH"):
         SwapStage().sources(SwapConfig(), {})
