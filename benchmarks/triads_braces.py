@@ -28,6 +28,7 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, is_primary, teeth_of
 from pipeline.artifacts.views import View
 from stages.dentition.working import labels_in_view
+from stages.init.dental.numbering.colours import BAND
 from stages.init.dental.surface.photos.braces import braces_in
 
 Array = npt.NDArray[np.float64]
@@ -38,8 +39,9 @@ SORTS = {
     "dark": ((65, 60, 60), (28, 25, 25), (122, 120, 120)),
     "tied": ((155, 152, 150), (40, 90, 190), (178, 175, 175)),
 }
-#: Half width and height of a bracket, how far it stands out, and the wire's thickness (mm).
-HALF_WIDTH, HALF_HEIGHT, OUT, WIRE = 1.6, 1.5, 2.1, 0.45
+#: Half width and height of a bracket, how far it stands out and is sunk in, and the wire's
+#: thickness (mm).
+HALF_WIDTH, HALF_HEIGHT, OUT, SUNK, WIRE = 1.6, 1.5, 2.1, 0.3, 0.45
 #: A crown has a bracket if a photograph shows so many pixels of it, and a photograph shows it if
 #: the crown's surface there is no nearer than this (mm).
 LEAST_PIXELS, HIDDEN = 150, 2.0
@@ -47,8 +49,6 @@ LEAST_PIXELS, HIDDEN = 150, 2.0
 AROUND = 5
 #: Photographs are drawn so many times finer.
 FINER = 2
-#: Pixels per mm are those of a gum line to gum line distance of so many mm.
-BAND = 14.0
 
 
 @dataclass(frozen=True)
@@ -138,15 +138,17 @@ def _bracket(middles: list[Array | None], k: int) -> Bracket | None:
 def faces(bracket: Bracket, camera: Camera) -> Iterator[tuple[Array, Array]]:
     """Corners [4, 3] and normal [3] of the sides of a bracket that a camera looks at."""
     line = camera.centre - bracket.middle
-    x, y, z, back = np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), np.array([0, 0, OUT]), -0.3
-    for normal, middle, one, other in (
-        (bracket.out, z, x, y), (bracket.along, x, y, z), (-bracket.along, -x, y, z),
-        (bracket.up, y, x, z), (-bracket.up, -y, x, z),
-    ):  # fmt: skip
+    x, y, z = np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), np.array([0, 0, OUT])
+    base = -SUNK / OUT
+    for normal, middle, one, other, low in (
+        (bracket.out, z, x, y, -1.0),
+        (bracket.along, x, y, z, base),
+        (-bracket.along, -x, y, z, base),
+        (bracket.up, y, x, z, base),
+        (-bracket.up, -y, x, z, base),
+    ):
         if normal @ line > 0:
-            flat = normal is bracket.out
-            low = 0 if flat else back / OUT
-            corners = [(-1, -1 if flat else low), (1, -1 if flat else low), (1, 1), (-1, 1)]
+            corners = [(-1, low), (1, low), (1, 1), (-1, 1)]
             yield (
                 np.array([bracket.at(*(middle + a * one + b * other)) for a, b in corners]),
                 normal,
