@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 60
+    version = 61
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -26,7 +26,7 @@ from stages.init.dental.surface.chart.jaws import (
     facing,
     smooth_normals,
 )
-from stages.init.dental.surface.chart.raster import raster_chart, sees
+from stages.init.dental.surface.chart.raster import at_places, raster_chart, sees
 from stages.init.dental.surface.options import SurfaceOptions
 from stages.init.dental.surface.photos.photo import Photo
 from stages.init.dental.surface.photos.tissue import disc, joined_to
@@ -99,8 +99,8 @@ def uncovered(
             hidden = _hidden(chart, looks, number) & used
             depth, place = raster_chart(photo, points, used)
             near = (depth > 0) & (depth < nearest[number] + np.float32(HIDDEN))
-            covered[number] |= near & _at(place, hidden)
-            contested[number] |= near & _at(place, better)
+            covered[number] |= near & at_places(hidden, place)
+            contested[number] |= near & at_places(better, place)
     return in_threads(
         lambda item: _marked(*item), zip(photos, covered, contested, strict=True), threads
     )
@@ -139,12 +139,6 @@ def _hidden(chart: Chart, looks: list[_Look], number: int) -> Mask:
     upwards = slice(None, None, -1 if chart.shape.gumwards > 0 else 1)  # rows run downwards
     gumwards = np.logical_or.accumulate((hidden & own.beyond)[upwards], axis=0)[upwards]
     return np.asarray(hidden | (gumwards & own.beyond))
-
-
-def _at(place: Array32, samples: Mask) -> Mask:
-    """Samples [H, W] of a chart at places [h, w, 2] on it."""
-    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
-    return np.asarray(cv2.remap(samples.astype(np.float32), x, y, cv2.INTER_LINEAR) > _HALF)
 
 
 def _marked(photo: Photo, covered: Mask, contested: Mask) -> Photo:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -213,3 +214,28 @@ def within_crowns(grid: ChartGrid, shape: JawShape) -> npt.NDArray[np.bool_]:
     edge = np.interp(grid.arcs, *shape.line("tip", "embrasure"))
     height = grid.heights[:, None]
     return (up * (height - gum[None]) < 0) & (up * (height - edge[None]) > 0)
+
+
+def tooth_of_columns(grid: ChartGrid, shape: JawShape) -> npt.NDArray[np.int32]:
+    """[W] FDI number of the tooth that each column of a chart goes through; 0 beside the row.
+
+    Teeth end midway between papilla and embrasure, the first and the last one as far from its
+    middle as it begins.
+    """
+    middles = [
+        float(
+            unroll(
+                np.array([shape.landmarks[Landmark(kind, tooth)] for kind in ("zenith", "tip")])
+            )[0].mean()
+        )
+        for tooth in shape.teeth
+    ]
+    bounds = [np.nan]
+    for (one, two), around in zip(pairwise(shape.teeth), pairwise(middles), strict=True):
+        edge = shape.boundary(one, two)
+        bounds.append(float(np.mean(around if edge is None else unroll(np.array(edge))[0])))
+    if len(bounds) == 1:
+        return np.full(len(grid.arcs), shape.teeth[0], np.int32)
+    bounds = [2 * middles[0] - bounds[1], *bounds[1:], 2 * middles[-1] - bounds[-1]]
+    place = np.searchsorted(bounds, grid.arcs)
+    return np.array([0, *shape.teeth, 0], np.int32)[place]

@@ -21,7 +21,8 @@ from stages.init.dental.surface.chart.jaws import (
     nearest_depths,
     smooth_normals,
 )
-from stages.init.dental.surface.chart.raster import raster_chart
+from stages.init.dental.surface.chart.partial import partial_crowns
+from stages.init.dental.surface.chart.raster import at_places, raster_chart
 from stages.init.dental.surface.cover import uncovered
 from stages.init.dental.surface.ends import within_rows
 from stages.init.dental.surface.options import OUTLINE_ERROR, SurfaceOptions
@@ -60,6 +61,7 @@ class Looked:
         nearest: per photograph the z-depth [h, w] of the nearest chart.
         clear: per chart where it is seen clearly, [H, W] bool; None: everywhere.
         flanks: per chart and photograph where metal stands before it, [H, W] bool; empty: nowhere.
+        partial: the same of crowns that others show whole.
         charts: of the jaws.
         options: settings.
     """
@@ -69,6 +71,7 @@ class Looked:
     nearest: list[Array32]
     clear: list[Mask | None]
     flanks: list[list[Mask]]
+    partial: list[list[Mask]]
     charts: list[Chart]
     options: SurfaceOptions
 
@@ -113,7 +116,11 @@ def look_at(
         else []
         for chart in charts
     ]
-    return Looked(photos, shown, nearest, clear, flanks, charts, options)
+    partial = [
+        partial_crowns(chart, photos, nearest, options, threads) if options.only_clear else []
+        for chart in charts
+    ]
+    return Looked(photos, shown, nearest, clear, flanks, partial, charts, options)
 
 
 def _look(number: int, looked: Looked, reach: list[Array32]) -> SurfaceView:
@@ -137,27 +144,29 @@ def _look(number: int, looked: Looked, reach: list[Array32]) -> SurfaceView:
     certain = np.zeros(photo.size, bool)
     hidden = np.zeros(photo.size, bool)
     tooth = (photo.upper > 0) | (photo.lower > 0)
+    unsaid = np.zeros(photo.size, bool)
     rims: Sequence[Array32 | None] = reach or [None] * len(looked.charts)
-    for chart, seen, flanks, rim in zip(
-        looked.charts, looked.clear, looked.flanks, rims, strict=True
+    for chart, seen, flanks, partial, rim in zip(
+        looked.charts, looked.clear, looked.flanks, looked.partial, rims, strict=True
     ):
         z, place = raster_chart(
             photo, chart.points, chart.used(PAST_EDGE, looked.options.gum_height)
         )
-        x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
         if seen is not None:
-            z = z * (cv2.remap(seen.astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.5)
+            z = z * at_places(seen, place)
         if rim is not None:
-            z = z * (tooth | (cv2.remap(rim, x, y, cv2.INTER_LINEAR) > 0.5))
-        if flanks:
-            behind = cv2.remap(flanks[number].astype(np.float32), x, y, cv2.INTER_LINEAR)
-            hidden |= (z > 0) & (behind > 0.5)
+            z = z * (tooth | at_places(rim, place))
         mine = own[chart.shape.jaw]
+        if flanks:
+            hidden |= (z > 0) & at_places(flanks[number], place)
+        if partial:
+            unsaid |= (z > 0) & at_places(partial[number], place) & mine
         # The photograph itself says which jaw it shows; without a chart of that jaw, the other's.
         better = (z > 0) & tissue & ((depth == 0) | (z < depth)) & ~certain
         better |= (z > 0) & mine
         certain |= (z > 0) & mine
         normals = smooth_normals(chart.radius, chart.grid)
+        x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
         turned = np.asarray(cv2.remap(normals, x, y, cv2.INTER_LINEAR), np.float32)
         turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
         agreed = np.asarray(cv2.remap(chart.agreement, x, y, cv2.INTER_LINEAR))
@@ -166,6 +175,7 @@ def _look(number: int, looked: Looked, reach: list[Array32]) -> SurfaceView:
         agreement = np.where(better, agreed, agreement)
     if hidden.any():
         depth *= ~(hidden & metal(photo))
+    depth *= ~unsaid
     depth *= tooth | without_fringes(depth > 0, photo.density)
     depth *= joined_to(depth > 0, tooth)  # no crumbs of gum
     sure = confidence_of(agreement, looked.options.guess)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -10,6 +11,9 @@ from stages.init.dental.surface.photos.photo import Photo
 
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+
+#: Share from which a sample counts as one of a mask's.
+_HALF = 0.5
 
 
 @helper
@@ -92,6 +96,17 @@ def raster_chart(photo: Photo, points: Array32, used: Mask) -> tuple[Array32, Ar
     place = np.zeros((*photo.size, 2), np.float32)
     _raster(pixels, depths, used, depth, place)
     return depth, place
+
+
+def at_places(samples: Mask | Array32, place: Array32) -> Mask:
+    """[h, w] bool: whether samples [H, W] of a chart, 0..1, are more than half at places on it.
+
+    Args:
+        samples: of the chart.
+        place: [h, w, 2] float32 column and row, of `raster_chart`.
+    """
+    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+    return np.asarray(cv2.remap(samples.astype(np.float32), x, y, cv2.INTER_LINEAR) > _HALF)
 
 
 def sees(photo: Photo, nearest: Array32, points: Array32, tolerance: float) -> Mask:
