@@ -91,6 +91,65 @@ def opened_film(file: BinaryIO) -> InputContainer:
     return container
 
 
+def promised_size(file: BinaryIO) -> int:
+    """Bytes that a film has by what its outermost boxes say, 0 where its format does not tell.
+
+    A film with fewer has lost its end, as a copy that was broken off: decoders end there without a
+    word. Told of AVI, Matroska and WebM; of MP4 and MOV the index says more, the number of frames.
+
+    Args:
+        file: at any place.
+    """
+    file.seek(0)
+    sort = reader_for(file.read(HEAD))
+    file.seek(0)
+    if sort == "avi":
+        return _end_of_riff(file)
+    return _end_of_segment(file) if sort == "matroska" else 0
+
+
+def _end_of_riff(file: BinaryIO) -> int:
+    """Where the last of the ``RIFF`` chunks ends; long films have several."""
+    end = 0
+    while True:
+        file.seek(end)
+        head = file.read(8)
+        # a film whose recorder lost its power still says 0
+        if head[:4] != b"RIFF" or len(head) < 8 or head[4:] == bytes(4):
+            return end
+        size = int.from_bytes(head[4:], "little")
+        end += 8 + size + size % 2
+
+
+def _end_of_segment(file: BinaryIO) -> int:
+    """Where Matroska's ``Segment`` ends; 0 where it does not say, as a stream."""
+    for _ in range(8):  # its head, and padding
+        name, size = _ebml_number(file, keep=True), _ebml_number(file)
+        if name is None or size is None:
+            return 0
+        if name == 0x18538067:
+            return file.tell() + size
+        file.seek(size, 1)
+    return 0
+
+
+def _ebml_number(file: BinaryIO, *, keep: bool = False) -> int | None:
+    """A number of as many bytes as its first bits say; None: none, or the mark of one not known.
+
+    Args:
+        keep: with the bits that say how long it is, as names have them.
+    """
+    first = file.read(1)
+    if not first or not first[0]:
+        return None
+    length = 9 - first[0].bit_length()
+    value = int.from_bytes(first + file.read(length - 1))
+    mask = (1 << 7 * length) - 1
+    if keep:
+        return value
+    return None if value & mask == mask else value & mask
+
+
 class _Nameless:
     """A file to read from without the name that FFmpeg would resolve other names against."""
 

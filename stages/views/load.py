@@ -122,8 +122,8 @@ def load_photos(
                 loaded += result
                 if result[0].pages > 1:
                     warn(
-                        f"{label} has {result[0].pages} pages, of which the first is used. Save "
-                        "the others as files of their own, if they are wanted."
+                        f"{label} holds {result[0].pages} pictures, of which the first is used. "
+                        "Save the others as files of their own, if they are wanted."
                     )
         except BaseException:  # an interrupt does not wait for what is being decoded
             decoder.stop()

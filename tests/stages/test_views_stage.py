@@ -186,8 +186,24 @@ def test_further_pages_of_a_file_are_mentioned(tmp_path: Path) -> None:
     write(tmp_path / "in" / "b.tif", picture(4))
     views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
     assert context.warnings == [
-        "a.tif has 3 pages, of which the first is used. Save the others as files of their own, if "
-        "they are wanted."
+        "a.tif holds 3 pictures, of which the first is used. Save the others as files of their "
+        "own, if they are wanted."
+    ]
+    np.testing.assert_allclose(views.views[0].image * 255, picture(0), atol=0.01)
+
+
+@pytest.mark.parametrize("ending", ["png", "webp"])
+def test_the_other_pictures_of_an_animation_are_mentioned(tmp_path: Path, ending: str) -> None:
+    (tmp_path / "in").mkdir()
+    first, *more = (Image.fromarray(picture(n)) for n in range(3))
+    first.save(
+        tmp_path / "in" / f"a.{ending}", save_all=True, append_images=more, duration=100,
+        **({"lossless": True} if ending == "webp" else {}),
+    )  # fmt: skip
+    write(tmp_path / "in" / "b.png", picture(4))
+    views, context, _ = run_stage(tmp_path / "out", [tmp_path / "in"])
+    assert [message.split(". ")[0] for message in context.warnings] == [
+        f"a.{ending} holds 3 pictures, of which the first is used"
     ]
     np.testing.assert_allclose(views.views[0].image * 255, picture(0), atol=0.01)
 

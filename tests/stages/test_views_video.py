@@ -334,3 +334,17 @@ def test_a_film_whose_index_comes_first_may_break_off(tmp_path: Path) -> None:
     assert [message.split(":")[0] for message in context.warnings] == [
         "x.mp4 breaks off", "x.mp4 is damaged",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", ["avi", "mkv", "webm"])
+def test_a_film_without_a_count_of_its_frames_that_breaks_off_is_said_to(
+    tmp_path: Path, ending: str
+) -> None:
+    path = film(tmp_path / f"x.{ending}", codec="libvpx" if ending == "webm" else "mpeg4", bars=8)
+    _, context = run_stage(tmp_path / "whole", path)
+    assert context.warnings == []
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    _, context = run_stage(tmp_path / "cut", path)
+    said = f"x.{ending} breaks off: its end is missing, 67 % of its bytes are there."
+    assert context.warnings.count(said) == 1

@@ -54,7 +54,8 @@ class Photo:
         orientation: EXIF orientation 1..8, still to be applied.
         focal_px: focal length in stored pixels, or None.
         taken_at: by the camera's clock, seconds; or None.
-        pages: pictures in the file, of which this is the first; smaller copies do not count.
+        pages: pictures in the file (pages, or those of an animation), of which this is the first;
+            smaller copies do not count.
     """
 
     rgb: Bytes
@@ -96,7 +97,8 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
                 image.load()
                 deep = header.bits == 16 and header.kind in ("PNG", "TIFF")
                 rgb, valid = _deep(data, header, image, profile) if deep else shown(image, profile)
-            pages = 1
+            # what follows in a JPEG is a map of its brightness, and HEIC names the one to show
+            pages = getattr(image, "n_frames", 1) if header.kind in ("PNG", "WEBP") else 1
             if header.kind == "TIFF":  # Pillow and OpenCV have turned it upright
                 pages = _pages(image)
                 rgb = make_stored(rgb, orientation)

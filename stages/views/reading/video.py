@@ -99,6 +99,9 @@ def map_frames(
                 continue
             elif "there" in reply:
                 warn(f"breaks off: of its {reply['of']} frames {reply['there']} are there.")
+            elif "share" in reply:
+                share = 100 * reply["share"]
+                warn(f"breaks off: its end is missing, {share:.0f} % of its bytes are there.")
             elif "left_out" in reply:
                 warn("is damaged: frames that can't be decoded are left out.")
             elif "again" in reply:

@@ -14,12 +14,14 @@ import av
 
 from pipeline.untrusted.child import Arrays, Reply, Values
 from pipeline.untrusted.files import UnusableFile
-from pipeline.untrusted.films import MAX_PIXELS, opened_film
+from pipeline.untrusted.films import MAX_PIXELS, opened_film, promised_size
 from stages.views.reading.shown import shown, shown_size, turn_of
 from stages.views.sampling import even_in_time, uniform_indices
 
 #: Readers of films that hold an index of their frames.
 WITH_INDEX = ("mov", "matroska")
+#: Bytes that a film may be shorter than it says: some programs count its head twice.
+SLACK = 64
 #: Pixels of the long side of a glance.
 GLANCE = 64
 #: Frames to glance at for each that is wanted, at most, and key frames, at least.
@@ -108,6 +110,9 @@ def _contents(file: BinaryIO) -> Generator[Reply, None, _Contents]:
         known = container.format.name.startswith(WITH_INDEX)
         if number < stream.frames and container.format.name.startswith("mov"):
             yield {"there": number, "of": stream.frames}, []
+    there, promised = os.fstat(file.fileno()).st_size, promised_size(file)
+    if there + SLACK < promised:
+        yield {"share": there / promised}, []
     timed = sorted((time, key) for time, key in packets if time is not None)
     shown, keys = [time for time, _ in timed], [n for n, (_, key) in enumerate(timed) if key]
     if not known or keys[:1] != [0] or len(set(shown)) < len(packets):
