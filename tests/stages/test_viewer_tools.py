@@ -324,6 +324,36 @@ def test_everything_has_a_name_and_a_place(tmp_path: Path, width: int) -> None:
     assert found["live"] >= 2
 
 
+SIDES = """(async () => {
+  await page.ready;
+  press("d"); press("t");
+  page.render();
+  const tools = $("tools").getBoundingClientRect();
+  const divide = document.querySelector("#drawing .divide").getBoundingClientRect();
+  const bar = [...$("bar").children].map((group) => group.getBoundingClientRect());
+  tell({
+    end: 2 * divide.left, tools: [tools.left, tools.top, tools.width],
+    bar: bar.filter((box) => box.width && box.bottom > tools.top && box.top < tools.bottom
+      && box.right > tools.left).length,
+    width: innerWidth, height: innerHeight,
+    errors: document.documentElement.dataset.errors ?? "",
+  });
+})();"""
+
+
+@needs_chromium
+@pytest.mark.parametrize("width", [1280, 820, 700, 390])
+def test_the_tools_cover_no_part_of_two_panes(tmp_path: Path, width: int) -> None:
+    found, log = run_in(ball_page(), HEAD + SIDES, tmp_path, (width, 780), address="#still")
+    assert (found["errors"], log, found["width"]) == ("", [], width)
+    left, top, wide = found["tools"]
+    if width < 820:
+        assert (left, wide) == (0, width) and top > 0.5 * found["height"], "they lie below"
+    else:
+        assert width / 2 < found["end"] <= left, "they stand beside"
+    assert found["bar"] == 0
+
+
 def test_colours_can_be_told_apart() -> None:
     """Text on the panels has a contrast of 4.5 and more (WCAG 2.1), even over white teeth."""
     style = (viewer_page.HERE / "viewer.css").read_text()

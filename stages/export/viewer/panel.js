@@ -115,6 +115,7 @@ function addPanel(viewer, tools) {
     for (const key of ["support", "mesh", "sides"]) byId(key).checked = now[key];
     byId("legend").hidden = !now.support;
     byId("opacity").disabled = now.sides;  // there is no photograph of two panes
+    document.body.classList.toggle("two-panes", now.sides);
     byId("at").value = Math.round(100 * now.at);
     byId("at").closest("label").hidden = now.axis === "off";
     for (const button of byId("measured").querySelectorAll("button")) {

@@ -119,7 +119,8 @@ class Viewer extends Screen {
     return {
       below: Math.min(Math.max(byId("bar").offsetHeight, sheet ? tools.offsetHeight : 0) / height,
         0.5),
-      beside: sheet || byId("bar").hidden ? 0 : Math.min(tools.offsetWidth / width, 0.4),
+      beside: sheet || tools.hidden || byId("bar").hidden ? 0
+        : Math.min(1 - tools.offsetLeft / width, 0.4),
     };
   }
 
