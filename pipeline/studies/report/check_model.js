@@ -128,7 +128,7 @@ const problemsOf = (photo) => {
     if (same.length > 1) {
       const often = same.length === 2 ? "twice: right only for two parts of one crown"
         : `${same.length} times`;
-      found.push({ text: `${number} stands ${often}`,
+      found.push({ text: `${number} stands ${often}`, possible: same.length === 2,
         crowns: same.map((crown) => crown.id) });
     }
   }

@@ -167,7 +167,8 @@ const drawCard = (photo) => {
   drawCrowns(photo, card);
   card.notes.replaceChildren(
     ...(photo.mirrored ? [make("p", {}, "A mirror image: shown turned over.")] : []),
-    ...problems.map((problem) => make("p", { class: "wrong" }, `Can't be: ${problem.text}.`)));
+    ...problems.map(({ text, possible }) => make("p", { class: "wrong" },
+      `${possible ? "" : "Can't be: "}${text}.`)));
   const first = photo.crowns.some((crown) => crown.id === chosen?.id) ? null
     : [...rowOf(photo, "upper"), ...rowOf(photo, "lower")][0];
   const rows = ["upper", "lower"].map((jaw) => {
