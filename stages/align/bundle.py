@@ -74,6 +74,7 @@ class Bundle:
         tracks: points that were used.
         before, after: median reprojection error, pixels; nan if it was not asked.
         reason: why nothing was changed; empty if something was.
+        view: name of the one that the reason ends with, if any.
     """
 
     cameras: dict[str, Camera]
@@ -81,6 +82,7 @@ class Bundle:
     before: float
     after: float
     reason: str = ""
+    view: str = ""
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,7 @@ def refine_with_matches(
     unknown = float("nan")
     if min(seen) < options.min_matches:
         worst = names[int(np.argmin(seen))]
-        reason = f"only {min(seen)} are in view {worst}"
-        return Bundle(kept, len(tracks), unknown, unknown, reason)
+        return Bundle(kept, len(tracks), unknown, unknown, f"only {min(seen)} are in", worst)
     placed = [cameras[name] for name in names]
     model = _model(placed, found, tracks, options)
     before = float(np.median(_errors(model)))

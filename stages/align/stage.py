@@ -245,8 +245,10 @@ def _matched(context, views, pairs, start, figures):  # type: ignore[no-untyped-
     figures["matched_points"] = bundle.tracks
     if bundle.reason:
         if config.matches == "always":
+            titles = {view.name: view.source_name or view.name for view in views.views}
+            why = f"{bundle.reason} {titles.get(bundle.view, '')}".strip()
             context.warn(
-                f"The {bundle.tracks:,} matched points change no camera: {bundle.reason} "
+                f"The {bundle.tracks:,} matched points change no camera: {why} "
                 "(align.matches=always, align.match_min)."
             )
         return start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import permutations
 
 import cv2
@@ -102,7 +103,7 @@ def test_good_cameras_and_scarce_matches_stay(world):
     assert bundle.reason == "they agree with the pointmaps"
     assert bundle.cameras == before
     bundle = refine_with_matches(*given, BundleOptions(min_matches=100_000))
-    assert "in view" in bundle.reason
+    assert bundle.reason.endswith(" are in") and bundle.view in before
     assert bundle.cameras == before
 
 
@@ -158,6 +159,18 @@ def test_matches_that_are_asked_for_are_used_for_given_cameras_too(world, tmp_pa
             for name, camera in before.items():
                 off = found[name].cam_from_world - camera.cam_from_world
                 assert np.abs(off).max() < 1e-14
+
+
+def test_the_photograph_with_too_few_matches_is_called_by_its_name(world, tmp_path):
+    pictures = zip(world[0], world[1], strict=True)
+    views = Views(tuple(View(c.name, i, source_name=f"{c.name}.jpg") for c, i in pictures))
+    given = Cameras(tuple(aligned(world, 0.0)[0].values()))
+    inputs = {"views": views, "pointmaps": Pointmaps(pointmaps(world, 0.0)), "cameras": given}
+    config = AlignConfig(matches="always", match_min=3000)
+    context = LocalContext(config, tmp_path, inputs, threads=2)
+    AlignStage().run(context)
+    (said,) = context.warnings
+    assert re.search(r": only \d+ are in \w+\.jpg \(align\.matches=always", said)
 
 
 @pytest.mark.parametrize(
