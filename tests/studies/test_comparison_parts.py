@@ -333,6 +333,23 @@ def test_points_without_anything_to_measure_them_by_are_counted():
     assert "nearest" not in table.explanation
 
 
+def test_which_of_several_models_the_points_are_of_is_said():
+    near = {"to_other_percent": {"median": 1, "p90": 2}}
+    rows = [
+        {"name": "sap (ours)", "points": 4711, "cloud": near},
+        {"name": "COLMAP, defaults", "points": 8, "model": "1"},
+    ]
+    figures = {
+        "reference": None, "reference_views": 0, "views": NAMES, "units": "mm", "cameras": [],
+        "points": rows, "points_to": "COLMAP, defaults",
+    }  # fmt: skip
+    (table,) = tables_of(figures)
+    assert "COLMAP's points (COLMAP, defaults)" in table.explanation
+    assert table.notes == [
+        ("COLMAP, defaults", "of its models the points are those of number 1, the largest")
+    ]
+
+
 def test_numbered_photographs_are_not_taken_for_numbered_views(tmp_path, monkeypatch):
     """Views 000, 001, 002 of photographs 001, 002, 000: only the right cameras may match."""
     cameras = true_cameras()

@@ -161,6 +161,7 @@ def _compare(
         "units": units,
         "cameras": [entry.row for entry in entries if not entry.borrowed],
         "points": _point_rows(entries, best, reference, surface),
+        "points_to": best.name if best else None,
         "pairs": {entry.name: entry.row.pop("pairs") for entry in rivals if "pairs" in entry.row},
     }
     if fit and rivals:
@@ -341,6 +342,8 @@ def _point_rows(
         if entry.points is None:
             continue
         row: dict[str, Any] = {"name": entry.name, "points": len(entry.points)}
+        if entry.model is not None and len(entry.model.sizes) > 1:
+            row["model"] = entry.model.folder.name
         rows.append(row)
         motion = _motion(entry, reference)
         if motion is None:

@@ -86,6 +86,10 @@ def _cameras(figures: Mapping[str, Any]) -> Table:
 def _points(figures: Mapping[str, Any]) -> Table:
     rows = figures["points"]
     notes = [(row["name"], row["failure"]) for row in rows if row.get("failure")]
+    notes += [
+        (row["name"], f"of its models the points are those of number {row['model']}, the largest")
+        for row in rows if row.get("model")
+    ]  # fmt: skip
     if any("mesh" in row for row in rows):
         unit = figures["units"] if figures["units"] == "mm" else "units"
         near = next(
@@ -128,8 +132,8 @@ def _points(figures: Mapping[str, Any]) -> Table:
     ]  # fmt: skip
     text = (
         "Distance of our points to COLMAP's nearest, and back, in % of the extent of COLMAP's "
-        "points; median / 90 %. COLMAP's are sparse: the way back tells more. Aligned by the "
-        "cameras."
+        f"points ({figures['points_to']}); median / 90 %. COLMAP's are sparse: the way back tells "
+        "more. Aligned by the cameras."
     )
     return Table("Points", text, head, cells, notes)
 
