@@ -57,6 +57,8 @@ class Pace:
 
     def __init__(self) -> None:
         self._step: tuple[str, str] | None = None
+        #: When the step began and when its first piece was done, with how many there were then.
+        self._marks: list[tuple[float, int]] = []
 
     def time_left(self, stage: str, step: str, done: int, total: int, now: float) -> str:
         """E.g. ``12 s left``; empty while nothing is known.
@@ -65,12 +67,15 @@ class Pace:
             now: a clock's seconds.
         """
         if self._step != (stage, step):
-            self._step, self._start, self._first = (stage, step), now, done
-        elapsed, gained = now - self._start, done - self._first
-        if gained <= 0 or done >= total or elapsed < 1.0:
+            self._step, self._marks = (stage, step), [(now, done)]
+        if len(self._marks) == 1 and done > self._marks[0][1]:
+            # kernels that are compiled or loaded make the first piece slower than any other
+            self._marks.append((now, done))
+        since, first = self._marks[-1]
+        if len(self._marks) == 1 or done <= first or done >= total or now - since < 1.0:
             return ""
-        seconds = elapsed * (total - done) / gained
-        return f"{seconds:.0f} s left" if seconds < 90 else f"{seconds / 60:.0f} min left"
+        each = min((now - start) / (done - before) for start, before in self._marks)
+        return f"{in_words(each * (total - done))} left"
 
 
 class LineReporter(Reporter):

@@ -28,6 +28,13 @@ def test_time_left() -> None:
     assert pace.time_left("fit", "others", 55, 100, now=800.0) == ""  # another step
 
 
+def test_time_left_does_not_go_by_the_first_piece_which_waits_for_kernels() -> None:
+    pace = Pace()
+    said = [pace.time_left("export", "video", n, 200, now=5.0 * (n > 0) + n / 4) for n in range(9)]
+    assert said[:5] == [""] * 5
+    assert said[5:] == ["49 s left", "48 s left", "48 s left", "48 s left"]
+
+
 def test_describe() -> None:
     assert describe({"loss": 0.03125, "gaussians": 20000}) == "loss 0.03125, gaussians 20000"
 
