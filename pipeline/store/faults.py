@@ -19,7 +19,17 @@ _IN_THE_WAY = (
 )  # fmt: skip
 
 
+#: A file where a folder is to be made: 'File exists' sounds as if all were well.
+_NO_FOLDER = {
+    errno.EEXIST: "there is something else of that name",
+    errno.ENOTDIR: "a part of its path is no folder",
+}
+
+
 def reason_of(error: OSError) -> str:
+    """Why the file system refuses, as is said to the user."""
+    if error.errno in _NO_FOLDER:
+        return _NO_FOLDER[error.errno]
     return error.strerror or type(error).__name__
 
 

@@ -151,7 +151,7 @@ def test_unwritable_workspace_is_refused(toys: Path) -> None:
     (toys / "w").write_text("a file, not a folder")
     done = call(toys, *RUN)
     assert done.returncode == 2
-    assert "can't be written to" in done.stderr
+    assert "w can't be written to (there is something else of that name)" in done.stderr
 
 
 def test_really_full_disk(toys: Path) -> None:

@@ -211,8 +211,10 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
 
     monkeypatch.setattr(comparing, "compare_visits", refused)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RequestError, match="can't be written to"):
+    with pytest.raises(RequestError, match=r"written to \(a part of its path is no folder\)"):
         run_register(*workspaces, tmp_path / "file" / "out")
+    with pytest.raises(RequestError, match=r"\(there is something else of that name\)\. Name an"):
+        run_register(*workspaces, tmp_path / "file")
     with pytest.raises(ReconstructionError):
         run_register(*workspaces, tmp_path / "out")
     assert not (tmp_path / "out").exists()
