@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,7 +61,13 @@ def test_numbered_teeth_of_a_run_that_succeeded_can_be_checked_too(tmp_path: Pat
 def test_without_numbers_there_is_no_page_and_an_old_one_goes(tmp_path: Path) -> None:
     workspace = doubtful_case(tmp_path / "case")
     run_report(workspace)
-    assert (workspace / "check.html").is_file()
+    titles = [
+        re.search("<title>(.*)</title>", (workspace / name).read_text())[1]
+        for name in ("check.html", "report.html")
+    ]
+    assert titles == [
+        "case: teeth to check · dentalsplat", "case: report of the run · dentalsplat",
+    ], "tabs of a browser can be told apart"  # fmt: skip
     bare = Teeth(tuple(case.dentition(f"{k:03d}", "front", [0] * 6, [0] * 6) for k in range(3)))
     write_result(workspace, "init", [bare])
     report = run_report(workspace).read_text()
