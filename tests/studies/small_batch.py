@@ -34,7 +34,7 @@ def write_cases(folder: Path) -> None:
 
 def summary(out: Path) -> list[dict[str, str]]:
     """The rows of a batch's table."""
-    with (out / "summary.csv").open() as stream:
+    with (out / "summary.csv").open(encoding="utf-8-sig") as stream:
         return list(csv.DictReader(stream))
 
 

@@ -92,7 +92,8 @@ def test_cases_are_run_once_and_seen_again(here: Any, tmp_path: Path) -> None:
     assert (one["teeth"], one["placed"], one["photographs"], one["psnr"]) == (3, 3, 3, 33.0)
     assert one["seconds"] > 0 and one["peak_memory_mb"] > 10
     assert found["clinic/like a"]["like"] == "a"
-    with (tmp_path / "out" / "summary.csv").open() as stream:
+    assert (tmp_path / "out" / "summary.csv").read_bytes().startswith(b"\xef\xbb\xbfname,state,")
+    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8-sig") as stream:
         rows = {row["name"]: row for row in csv.DictReader(stream)}
     assert rows["clinic/b"]["viewer"] == "cases/clinic__b/results/viewer.html"
     assert (tmp_path / "out" / rows["clinic/b"]["viewer"]).is_file()

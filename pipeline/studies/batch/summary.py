@@ -41,7 +41,8 @@ def write_summary(
         records: all cases, in their order.
         note: how far it is.
     """
-    write_atomic(out / "summary.csv", csv_text(records))
+    # without the mark spreadsheets take umlauts for two letters each
+    write_atomic(out / "summary.csv", f"\ufeff{csv_text(records)}")
     known = {record["id"]: record for record in records}
     counts = Counter(record["state"] for record in records)
     write_page(
