@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import shutil
 import sys
 import threading
 import time
@@ -117,6 +118,25 @@ def test_cases_are_run_once_and_seen_again(here: Any, tmp_path: Path) -> None:
     (tmp_path / "cases" / "a" / "1.jpg").rename(tmp_path / "cases" / "a" / "9.jpg")
     here(overrides=["fit.megabytes=1"])
     assert computed(tmp_path)["views"] == 1
+
+
+def test_what_was_moved_away_is_not_linked_to(here: Any, tmp_path: Path) -> None:
+    add_case(tmp_path, "anna", 1, 2)
+    add_case(tmp_path, "ben o", 1, 3)
+    before = here()
+    place = tmp_path / "out" / "cases" / "ben_o"
+    place.rename(tmp_path / "elsewhere")
+    told = here()
+    assert computed(tmp_path) == {}, "it is done all the same"
+    assert told["anna"] == before["anna"]
+    assert (told["ben o"]["state"], told["ben o"]["links"]) == ("done", {})
+    assert "results, viewer (cases/ben_o in the folder" in told["ben o"]["reason"]
+    assert "--retry 'ben o' makes it anew" in told["ben o"]["reason"]
+    assert 'href="cases/ben_o/' not in (tmp_path / "out" / "summary.html").read_text()
+    (tmp_path / "elsewhere").rename(place)
+    assert here() == before
+    shutil.rmtree(place)
+    assert here(retry=["ben o"])["ben o"]["links"] == before["ben o"]["links"]
 
 
 def test_every_end_has_its_state_and_others_go_on(run: Any, tmp_path: Path) -> None:

@@ -135,11 +135,28 @@ def _standing(
             and case.id not in retried
             and not (keep == "results" and before["state"] == "done" and not before["kept"])
         ):
-            records[case.id] = before
+            records[case.id] = _as_it_is(out, case, before)
         else:
             records[case.id] = new_record(case, "waiting")
             waiting.append(case)
     return records, waiting, retried
+
+
+def _as_it_is(out: Path, case: Case, record: dict[str, Any]) -> dict[str, Any]:
+    """The record of a finished case, without links to what has been moved or deleted since.
+
+    It is not run again for that: whoever needs the room may have put it elsewhere.
+    """
+    workspace = workspace_of(out, case)
+    here = {name: link for name, link in record["links"].items() if (workspace / link).exists()}
+    if here == record["links"]:
+        return record
+    gone = sorted(set(record["links"]) - set(here))
+    why = (
+        f"Not there any more, moved or deleted: {', '.join(gone)} (cases/{case.id} in the folder "
+        f"of the batch). --retry {quote(case.name)} makes it anew."
+    )
+    return {**record, "links": here, "reason": " ".join(filter(None, [record["reason"], why]))}
 
 
 def check_folder(out: Path, place: Path, cases: Sequence[Case], *, chosen: bool) -> None:
