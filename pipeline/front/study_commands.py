@@ -194,8 +194,8 @@ def batch_command(
     """Run many cases, each in a process of its own, and keep a table of what came of them.
 
     For example: pipeline batch cases/ -o runs/clinic --jobs 2. Killed, interrupted, disk full? The
-    same command goes on; finished cases are not run again. DIR/summary.html and summary.csv say at
-    every moment how all stand. Exit status: 0 all cases are done; 3 some could not be
+    same command goes on; finished cases are not run again. FOLDER/summary.html and summary.csv say
+    at every moment how all stand. Exit status: 0 all cases are done; 3 some could not be
     reconstructed or used; 1 some were killed, or failed by a fault of ours; 2 the request is wrong.
     """
     from pipeline.studies.batch.progress import by_state, make_progress
