@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,16 @@ def test_what_goes_with_photographs_is_no_case(tmp_path: Path) -> None:
     found = {case.name: case.settled for case in find_cases(tmp_path, Names({}))}
     found.pop("@eaDir")
     assert found == {"anna": "", "Masks": "", "depth": ""}, "beside no photographs: names of cases"
+
+
+def test_folders_whose_names_are_written_alike_are_no_one_case(tmp_path: Path) -> None:
+    """The name of a file is bytes: one may hold what is no text, another say so in letters."""
+    for name in (b"\xffanna", rb"\xffanna"):
+        pictures(Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)))
+    first, second = find_cases(tmp_path, Names({}))
+    assert (first.name, first.settled) == (r"\xffanna", "")
+    assert (second.name, second.settled) == (r"\xffanna (2)", "wrong")
+    assert "written like that of this one" in second.reason and first.id != second.id
 
 
 def test_a_list_is_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

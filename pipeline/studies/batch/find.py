@@ -99,7 +99,23 @@ def find_cases(place: Path, names: Names) -> list[Case]:
 
     cases = list(_walk(place, place, (_identity(place),), {}))
     cases.sort(key=lambda case: natural_key(case.name))
+    cases = _called_apart(cases)
     return [replace(case, id=names.of(case.name)) for case in cases]
+
+
+def _called_apart(cases: Sequence[Case]) -> list[Case]:
+    """Names of files are bytes: two of them may be written alike, and would be one case."""
+    found: dict[str, Case] = {}
+    for case in cases:
+        name, number = case.name, 1
+        while name in found:
+            number += 1
+            name = f"{case.name} ({number})"
+        if number > 1 and not case.settled:
+            why = "The name of another folder is written like that of this one. Rename it."
+            case = Case("", case.name, settled="wrong", reason=why)
+        found[name] = replace(case, name=name)
+    return list(found.values())
 
 
 def as_case(called: str, images: Sequence[str | Path], overrides: tuple[str, ...] = ()) -> Case:
