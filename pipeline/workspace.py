@@ -236,7 +236,8 @@ def _can_be_read(preset: str | None, overrides: Iterable[str]) -> bool:
     return True
 
 
-def _still_there(path: str) -> bool:
+def still_there(path: str) -> bool:
+    """Are there photographs where a request has them? Of a pattern it is not asked."""
     try:
         return any(c in path for c in "*?[") or Path(path).exists()
     except OSError:  # too long a name, a folder of somebody else's
@@ -318,7 +319,7 @@ def status(
         preset, (kept, _) = remembered["preset"], installed_here(remembered["overrides"])
         taken_over = _as_options(preset, kept)
     images = request.images
-    there = [path for path in images if request.images_named or _still_there(path)]
+    there = [path for path in images if request.images_named or still_there(path)]
     request = make_request(there, request.workspace, preset, [*kept, *request.overrides], stages)
     config = config_of(replace(request, taken_over=taken_over))
     store = Store(request.workspace, verify=verify)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from pipeline.runner import Runner
 from pipeline.running.outcomes import RunSummary
 from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage, stage_names
-from pipeline.workspace import config_of, make_request
+from pipeline.untrusted.names import printable
+from pipeline.workspace import Request, config_of, make_request, read_request, still_there
 
 
 def run(
@@ -84,6 +86,11 @@ def run(
         reporter.message(
             f"Left out, since the stage is not installed here: {' '.join(request.left_out)}."
         )
+    if workspace is None and (others := _others_before(request)):
+        reporter.message(
+            f"{request.workspace} is also where other photographs go that are called so, those in "
+            f"{others}; it shows what was run last. To keep both, give each a folder: -w."
+        )
     log = None if dry_run else Log(request, reporter)
     reporter = log or reporter
     runner = Runner(request, config, reporter, verify=verify, profile=profile)
@@ -91,6 +98,28 @@ def run(
         return runner.dry_run(force=force)
     with kept_for(share_for(request.workspace, share)):
         return _logged(log, lambda: _run(runner, request.workspace, config, reporter, force))
+
+
+def _others_before(request: Request) -> str:
+    """The folder of the photographs that a workspace was last run on, if that is another one and
+    they are still there; else nothing."""
+    if not request.images_named:
+        return ""
+    try:
+        before = read_request(request.workspace)["images"]
+    except RequestError:  # it is none yet, or it is told later
+        return ""
+    earlier, now = ({_folder_of(path) for path in paths} for paths in (before, request.images))
+    if not earlier.isdisjoint(now) or not any(map(still_there, before)):
+        return ""
+    return printable(str(min(earlier)))
+
+
+def _folder_of(path: str) -> Path:
+    """Of a photograph, or a pattern that may name folders."""
+    real = Path(os.path.realpath(path))  # a link in a circle is told later
+    folders = (folder for folder in (real, *real.parents) if os.path.isdir(folder))  # noqa: PTH112
+    return next(folders)
 
 
 def _logged(log: Log | None, work: Callable[[], RunSummary]) -> RunSummary:

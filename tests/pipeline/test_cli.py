@@ -54,6 +54,27 @@ def test_run_ends_with_a_summary(toys: Path) -> None:
     assert again.stderr.count("cached") == 4
 
 
+def test_photographs_that_would_share_a_folder_are_said_to(toys: Path) -> None:
+    for clinic in ("north", "south"):
+        shutil.copytree(toys / "images", toys / clinic / "anna")
+    first, again, other = (
+        call(toys, "run", f"{clinic}/anna", "-c", "toy.yaml")
+        for clinic in ("north", "north", "south")
+    )
+    assert first.returncode == other.returncode == 0, other.stderr
+    assert "-w" not in first.stderr + again.stderr
+    said = " ".join(other.stderr.split())
+    assert "runs/anna is also where other photographs go that are called so, those in /" in said
+    assert (
+        f"{toys}/north/anna; it shows what was run last. To keep both, give each a folder: -w."
+        in said
+    )
+    for given in (["south/anna/*"], ["south/anna", "-w", "runs/anna"]):
+        assert "give each a folder" not in call(toys, "run", *given, "-c", "toy.yaml").stderr
+    shutil.move(toys / "south", toys / "moved")
+    assert "give each" not in call(toys, "run", "moved/anna", "-c", "toy.yaml").stderr
+
+
 def test_json_is_json(toys: Path) -> None:
     summary = json.loads(call(toys, *RUN, "--json").stdout)
     assert [stage["action"] for stage in summary["stages"]] == ["ran"] * 4
