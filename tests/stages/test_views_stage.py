@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PIL import Image, TiffImagePlugin
+from pillow_heif import register_heif_opener
 
 from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
@@ -192,8 +193,9 @@ def test_further_pages_of_a_file_are_mentioned(tmp_path: Path) -> None:
     np.testing.assert_allclose(views.views[0].image * 255, picture(0), atol=0.01)
 
 
-@pytest.mark.parametrize("ending", ["png", "webp"])
+@pytest.mark.parametrize("ending", ["png", "webp", "heic"])
 def test_the_other_pictures_of_an_animation_are_mentioned(tmp_path: Path, ending: str) -> None:
+    register_heif_opener()
     (tmp_path / "in").mkdir()
     first, *more = (Image.fromarray(picture(n)) for n in range(3))
     first.save(
@@ -205,7 +207,8 @@ def test_the_other_pictures_of_an_animation_are_mentioned(tmp_path: Path, ending
     assert [message.split(". ")[0] for message in context.warnings] == [
         f"a.{ending} holds 3 pictures, of which the first is used"
     ]
-    np.testing.assert_allclose(views.views[0].image * 255, picture(0), atol=0.01)
+    off = np.abs(views.views[0].image * 255 - picture(0)).mean()
+    assert off < (8 if ending == "heic" else 0.01)
 
 
 def test_two_identical_images(tmp_path: Path) -> None:

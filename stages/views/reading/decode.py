@@ -97,8 +97,9 @@ def decode_photo(data: bytes, check_size: Callable[[int, int], None] | None = No
                 image.load()
                 deep = header.bits == 16 and header.kind in ("PNG", "TIFF")
                 rgb, valid = _deep(data, header, image, profile) if deep else shown(image, profile)
-            # what follows in a JPEG is a map of its brightness, and HEIC names the one to show
-            pages = getattr(image, "n_frames", 1) if header.kind in ("PNG", "WEBP") else 1
+            # what follows in a JPEG is a map of its brightness
+            several = header.kind in ("PNG", "WEBP", "HEIF") and image.tell() == 0
+            pages = getattr(image, "n_frames", 1) if several else 1
             if header.kind == "TIFF":  # Pillow and OpenCV have turned it upright
                 pages = _pages(image)
                 rgb = make_stored(rgb, orientation)
