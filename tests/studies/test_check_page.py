@@ -85,6 +85,19 @@ def test_a_wrong_file_is_said_on_the_page(tmp_path: Path, text: str) -> None:
     assert "could not be drawn" not in (workspace / "report.html").read_text()
 
 
+@needs_chromium
+def test_a_case_of_a_batch_is_run_again_by_the_batch(tmp_path: Path) -> None:
+    """`pipeline run` would leave its summary as it is, and be refused where results are kept."""
+    (tmp_path / "out" / "cases").mkdir(parents=True)
+    (tmp_path / "out" / "batch.json").write_text("{}")
+    workspace = doubtful_case(tmp_path / "out" / "cases" / "anna")
+    change = "chip(0, '11').click(); press('1'); press('2');"
+    told = 'result.next = document.getElementById("next").textContent;'
+    result = probed(workspace, tmp_path / "browser", change, SAVE, told)
+    assert "Run the same pipeline batch again" in result["next"]
+    assert "pipeline run -w" not in result["next"]
+
+
 def test_what_was_said_of_another_picture_of_that_name_is_not_shown(tmp_path: Path) -> None:
     workspace = doubtful_case(tmp_path / "case")
     other, same = "{use: false, sha256: aaaa}", "{use: false, sha256: '1111'}"

@@ -24,6 +24,7 @@ from pipeline.errors import PICTURES, PipelineError
 from pipeline.pages.case import Case
 from pipeline.pages.page import CHECK, write_page
 from pipeline.pages.pictures import picture
+from pipeline.untrusted.own import BATCH
 
 Content = dict[str, Any]
 
@@ -66,7 +67,7 @@ def write_check_page(case: Case) -> bool:
     write_page(
         "pipeline.studies.report", TEMPLATE, out, title=case.workspace.resolve().name,
         data=content(teeth, views, corrections, case.load("teeth", "teeth"))
-        | {"command": command(case), "target": "" if own else str(path)},
+        | {"command": command(case), "target": "" if own else str(path), "batch": of_batch(case)},
         failure=(case.failed.failure or "").partition(PICTURES)[0]
         if case.failed else "",
         problem=problem, doubtful=round(100 * DOUBTFUL), corrections=CORRECTIONS,
@@ -192,6 +193,13 @@ def _entries(photo: PhotoCorrection, before: list[list[Content]]) -> Content:
         crowns.append(entry)
     said = {"use": photo.use, "kind": photo.kind, "mirrored": photo.mirrored}
     return said | {"crowns": crowns}
+
+
+def of_batch(case: Case) -> bool:
+    """Is it a case of a batch? Then that has to run it again: `pipeline run` would leave its
+    summary as it is, and finds nothing to go on from where only results are kept."""
+    cases = case.workspace.resolve().parent
+    return cases.name == "cases" and (cases.parent / BATCH).is_file()
 
 
 def command(case: Case) -> list[str]:

@@ -381,7 +381,9 @@ const save = async () => {
       !data.target && place ? make("span", {}, ": ", make("code", {}, place)) : "",
       how === "saved" ? ", unless you saved it there." : `. A second download may be called `
         + `otherwise: it has to be ${data.target ? "that file" : data.file}.`),
-      make("li", {}, "Run the same command again, or this one: ", make("pre", {}, command), " ", copy)),
+      make("li", {}, ...(data.batch
+        ? ["Run the same pipeline batch again: of its finished cases it does this one anew."]
+        : ["Run the same command again, or this one: ", make("pre", {}, command), " ", copy]))),
     make("details", {}, make("summary", {}, `What ${data.file} says`), make("pre", {}, text)));
   find("next").hidden = false;
   say("");
