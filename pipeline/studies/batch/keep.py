@@ -33,7 +33,7 @@ ORDER = (
 #: Long side of the summary's pictures, pixels.
 THUMBNAIL = 160
 #: Files of a workspace that only runs need; the stages' folders besides.
-_WORKING = (REQUEST, "pages.json", ".lock", "profile")
+_WORKING = (REQUEST, "pages.json", "profile")
 #: A link of the report to a file in `results/`.
 _RESULT_LINK = re.compile(r'<li[^>]*><a href="(results/[^"]+)">[^<]*</a></li>')
 #: What scene.json calls itself.
@@ -63,7 +63,7 @@ def keep_results(workspace: Path) -> list[str]:
         if results.is_symlink() or is_there(results):
             remove(results)
         made.rename(results)
-    for name in (*stage_names(), *_WORKING[:2], _WORKING[3]):
+    for name in (*stage_names(), *_WORKING):
         remove(workspace / name)
     for page in (REPORT, CHECK):
         if page in left_out:
