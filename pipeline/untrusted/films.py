@@ -109,16 +109,17 @@ def promised_size(file: BinaryIO) -> int:
 
 
 def _end_of_riff(file: BinaryIO) -> int:
-    """Where the last of the ``RIFF`` chunks ends; long films have several."""
+    """Where the last of the ``RIFF`` chunks ends; long films have one for each gigabyte."""
     end = 0
-    while True:
+    for _ in range(1000):
         file.seek(end)
         head = file.read(8)
         # a film whose recorder lost its power still says 0
         if head[:4] != b"RIFF" or len(head) < 8 or head[4:] == bytes(4):
-            return end
+            break
         size = int.from_bytes(head[4:], "little")
         end += 8 + size + size % 2
+    return end
 
 
 def _end_of_segment(file: BinaryIO) -> int:
@@ -129,6 +130,8 @@ def _end_of_segment(file: BinaryIO) -> int:
             return 0
         if name == 0x18538067:
             return file.tell() + size
+        if size > HEAD:
+            return 0
         file.seek(size, 1)
     return 0
 
