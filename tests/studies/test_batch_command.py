@@ -91,3 +91,23 @@ def test_interrupted_or_killed_it_leaves_no_orphan_and_goes_on(tmp_path: Path) -
     assert again.returncode == 0, told
     assert json.loads(out)["counts"] == {"done": 3}
     assert computed(tmp_path) == {"views": 1, "fit": 3, "export": 3}
+
+
+def test_what_is_in_the_way_in_the_folder_of_a_batch_is_no_fault_of_ours(tmp_path: Path) -> None:
+    for number, name in enumerate("abc"):
+        add_case(tmp_path, name, number, 10 + number)
+    (tmp_path / "out" / "cases").mkdir(parents=True)
+    (tmp_path / "out" / "cases" / "a").write_text("a file where the workspace is to be")
+    (tmp_path / "out" / "logs" / "b.txt").mkdir(parents=True)
+    process = command(tmp_path, "--json")
+    out, told = process.communicate(timeout=120)
+    assert process.returncode == 3, told
+    states = {record["name"]: record["state"] for record in json.loads(out)["cases"]}
+    assert states == {"a": "wrong", "b": "wrong", "c": "done"}
+    for place, why in (("cases/a", "there is something else"), ("logs/b.txt", "Is a directory")):
+        assert f"{tmp_path}/out/{place} can't be used ({why}" in told
+    assert told.count("add --retry failed") == 2
+    (tmp_path / "out" / "cases" / "a").unlink()
+    (tmp_path / "out" / "logs" / "b.txt").rmdir()
+    out, told = (again := command(tmp_path, "--json", "--retry", "failed")).communicate(timeout=120)
+    assert again.returncode == 0 and json.loads(out)["counts"] == {"done": 3}

@@ -23,6 +23,7 @@ from pipeline.measure import peak_mb_with_children
 from pipeline.process.privacy import kept_for, private_from_now_on
 from pipeline.running.outcomes import RunSummary
 from pipeline.store import is_disk_full
+from pipeline.store.faults import file_in_the_way
 from pipeline.store.locks import lock_of
 from pipeline.store.places import is_there, remove, size_of
 from pipeline.studies.batch.keep import keep_results, kept_aside, thumbnail_of, write_thumbnail
@@ -58,9 +59,20 @@ def main() -> None:
         with kept_for(job["share"]):
             run_case(job)
     except Exception as error:
-        if is_disk_full(error, Path(job["out"])):
+        out, case = Path(job["out"]), Case.from_dict(job["case"])
+        if is_disk_full(error, out):
             sys.exit(DISK_FULL)
-        raise
+        told = closed_to_us(error, out)
+        if not told:
+            raise
+        given = {"settings": job["settings"], "session": job["session"]}
+        write_case(out, new_record(case, "wrong", told, **given))
+
+
+def closed_to_us(error: BaseException, out: Path) -> str:
+    """What is said of a case where the batch's own folder can't be written to; else nothing."""
+    told = file_in_the_way(error, out)
+    return f"{told} It counts as wrong until then: add --retry failed." if told else ""
 
 
 def run_case(job: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from pipeline.installed import library_version
 from pipeline.measure import usable_cores
 from pipeline.process.privacy import Share, kept_for, share_for
 from pipeline.store.places import remove, stage_folder
+from pipeline.studies.batch.child import closed_to_us
 from pipeline.studies.batch.cluster import check_workers, connected, require_dask, slots
 from pipeline.studies.batch.keep import thumbnail_of
 from pipeline.studies.batch.plan import Plan, check_folder, make_plan
@@ -272,6 +273,8 @@ class _Work:
                 f"out. Look into logs/{case.id}.txt, and run with --retry failed."
             )
             record = new_record(case, "killed", why, **settings)
+        elif why := closed_to_us(error, self._home):
+            record = new_record(case, "wrong", why, **settings)
         else:
             why = f"A fault of ours on a worker: {type(error).__name__}: {error}"
             record = new_record(case, "fault", " ".join(why.split())[:600], **settings)
