@@ -119,16 +119,21 @@ const isUsed = (photo) => photo.use ?? !photo.aside;
 const kindOf = (photo) => photo.kindSaid ?? photo.kind;
 const isUnsure = (crown, from) => !crown.number || crown.doubt >= from;
 
-// What can't be right: [{ text, crowns: ids }].
+// Two neighbours of a row, which may be parts of one crown.
+const sideBySide = (photo, [a, b]) => a.jaw === b.jaw
+  && Math.abs(rowOf(photo, a.jaw).indexOf(a) - rowOf(photo, b.jaw).indexOf(b)) === 1;
+
+// What can't be right, or is seldom so (possible): [{ text, possible, crowns: ids }].
 const problemsOf = (photo) => {
   const found = [];
   const numbered = photo.crowns.filter((crown) => crown.number);
   for (const number of new Set(numbered.map((crown) => crown.number))) {
     const same = numbered.filter((crown) => crown.number === number);
     if (same.length > 1) {
-      const often = same.length === 2 ? "twice: right only for two parts of one crown"
-        : `${same.length} times`;
-      found.push({ text: `${number} stands ${often}`, possible: same.length === 2,
+      const possible = same.length === 2 && sideBySide(photo, same);
+      const often = possible ? "twice: right only for two parts of one crown"
+        : same.length === 2 ? "twice" : `${same.length} times`;
+      found.push({ text: `${number} stands ${often}`, possible,
         crowns: same.map((crown) => crown.id) });
     }
   }
@@ -140,7 +145,8 @@ const problemsOf = (photo) => {
       found.push({ text: `the ${jaw} numbers run backwards: is the photograph mirrored?`, crowns: [] });
     } else {
       steps.forEach(([a, b]) => found.push({
-        text: `${a.number} and ${b.number} are out of order`, crowns: [a.id, b.id] }));
+        text: `${a.number} and ${b.number} are out of order: right only for teeth that have changed places`,
+        possible: true, crowns: [a.id, b.id] }));
     }
   }
   const lean = numbered.reduce((sum, crown) => sum + Math.sign(standing(crown.number)), 0);

@@ -154,7 +154,7 @@ const drawCard = (photo) => {
   const problems = problemsOf(photo);
   const wrong = new Set(problems.flatMap((problem) => problem.crowns));
   card.root.classList.toggle("cutting", cut !== null && chosen.photo === photo);
-  card.sure.disabled = problems.length > 0
+  card.sure.disabled = problems.some(({ possible }) => !possible)
     || !photo.crowns.some((crown) => crown.number && crown.doubt);
   card.kind.value = kindOf(photo) in KIND_NAMES ? kindOf(photo) : "";
   card.image.setAttribute("transform", photo.mirrored ? `translate(${photo.width} 0) scale(-1 1)` : "");
