@@ -111,3 +111,32 @@ def test_what_is_in_the_way_in_the_folder_of_a_batch_is_no_fault_of_ours(tmp_pat
     (tmp_path / "out" / "logs" / "b.txt").rmdir()
     out, told = (again := command(tmp_path, "--json", "--retry", "failed")).communicate(timeout=120)
     assert again.returncode == 0 and json.loads(out)["counts"] == {"done": 3}
+
+
+def test_a_case_that_was_renamed_keeps_what_it_has(tmp_path: Path) -> None:
+    for number, name in enumerate(("anna", "ben", "carl")):
+        add_case(tmp_path, name, number, 10 + number)
+
+    def states(*arguments: str) -> dict[str, tuple[str, str]]:
+        (tmp_path / "log.txt").write_text("")
+        process = command(tmp_path, "--json", *arguments)
+        out, told = process.communicate(timeout=120)
+        assert process.returncode == 0, told
+        return {each["name"]: (each["id"], each["state"]) for each in json.loads(out)["cases"]}
+
+    states()
+    said = tmp_path / "out" / "cases" / "anna" / "teeth.yaml"
+    said.write_text("what was put right")
+    states()
+    (tmp_path / "cases" / "north").mkdir()
+    (tmp_path / "cases" / "anna").rename(tmp_path / "cases" / "north" / "Anna 2026")
+    (tmp_path / "cases" / "ben").rename(tmp_path / "cases" / "dora")
+    (tmp_path / "cases" / "dora" / "1.jpg").write_text("8")  # another photograph: another case
+    expected = {
+        "north/Anna 2026": ("anna", "done"), "dora": ("dora", "done"), "carl": ("carl", "done"),
+    }  # fmt: skip
+    assert states() == expected
+    assert computed(tmp_path) == {"views": 1, "fit": 1, "export": 1}, "dora alone"
+    assert said.exists()
+    assert states() == expected and computed(tmp_path) == {}
+    assert not (tmp_path / "out" / "cases" / "north__Anna_2026").exists()

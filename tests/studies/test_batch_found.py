@@ -11,7 +11,7 @@ import pytest
 from pipeline.errors import RequestError
 from pipeline.studies.batch import plan
 from pipeline.studies.batch.find import Names, find_cases
-from pipeline.studies.batch.records import new_record, write_case
+from pipeline.studies.batch.records import Case, new_record, write_case
 from pipeline.studies.batch.sources import settings_of
 
 
@@ -106,3 +106,21 @@ def test_a_list_is_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert [entry.id for entry in third.waiting] == [entry.id for entry in first.cases[1:]]
     assert third.records[case.id]["state"] == "done"
     assert plan.make_plan(*given).again().waiting == third.waiting
+
+
+def test_a_case_is_known_again_only_where_its_photographs_have_gone(tmp_path: Path) -> None:
+    """Two lists may have the same ones under names of their own, with other settings."""
+    (tmp_path / "records").mkdir()
+    photo = pictures(tmp_path / "anna") / "0.jpg"
+    old = Case("anna", "anna", files=((str(photo), 1, 7),))
+    write_case(tmp_path, new_record(old, "done"))
+    for place, files, known in (
+        (photo, ((str(photo), 1, 7),), "new"),
+        (photo.with_name("moved"), ((str(tmp_path / "elsewhere" / "0.jpg"), 1, 7),), "anna"),
+        (photo.with_name("moved"), ((str(tmp_path / "elsewhere" / "0.jpg"), 1, 8),), "new"),
+    ):
+        if photo != place and photo.exists():
+            photo.rename(place)
+        case = Case("new", "new", files=files)
+        (found,) = plan._known_again([case], {"anna": "anna"}, tmp_path)
+        assert found.id == known

@@ -94,6 +94,7 @@ def make_plan(
     names = Names(earlier)
     said = time.monotonic()
     cases = find_cases(place, names) if place.is_dir() else _listed(place, names)
+    cases = _known_again(cases, earlier, out)
     settings: dict[str, str] = {}
     for number, case in enumerate(cases):
         if time.monotonic() > said + PATIENCE:
@@ -132,6 +133,7 @@ def _standing(
         elif (
             before
             and is_finished(before, case, settings[case.id])
+            and before["name"] == case.name
             and case.id not in retried
             and not (keep == "results" and before["state"] == "done" and not before["kept"])
         ):
@@ -228,6 +230,30 @@ def _earlier(out: Path) -> dict[str, str]:
         if record is not None:
             found[record["name"]] = record["id"]
     return found
+
+
+def _known_again(cases: Sequence[Case], earlier: Mapping[str, str], out: Path) -> list[Case]:
+    """Cases that were renamed or moved keep the files that they have: what was computed, and what
+    a person has put right. They are known by their photographs, which are no longer where they were
+    (others may be in two lists, with other settings)."""
+    here = {case.name for case in cases}
+    left: dict[tuple[tuple[str, int, int], ...], str] = {}
+    for name, known in earlier.items():
+        record = None if name in here else read_case(out, known)
+        if record and record["files"] and not os.path.lexists(record["files"][0][0]):
+            left[_photographs(record["files"])] = known
+    found = []
+    for case in cases:
+        if case.files and not case.settled and case.name not in earlier:
+            case = replace(case, id=left.pop(_photographs(case.files), case.id))
+        found.append(case)
+    return found
+
+
+def _photographs(files: Sequence[Sequence[Any]]) -> tuple[tuple[str, int, int], ...]:
+    """Name, bytes and time of files, of those that lie where the first does: masks do not."""
+    parts = [(*os.path.split(path), size, time) for path, size, time in files]
+    return tuple(sorted((name, *stamp) for folder, name, *stamp in parts if folder == parts[0][0]))
 
 
 def _retried(cases: Sequence[Case], out: Path, retry: Sequence[str]) -> set[str]:
