@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 61
+    version = 62
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

@@ -9,18 +9,20 @@ from stages.init.dental.surface.chart.grid import AXIS_DEPTH
 from stages.init.dental.surface.photos.photo import Photo
 
 
-def photo(yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0) -> Photo:
+def photo(
+    yaw: float = 0.0, size: tuple[int, int] = (60, 100), seed: int = 0, focal: float = 150.0
+) -> Photo:
     a = np.radians(yaw)
     toward = np.array([np.sin(a), 0, np.cos(a)])
     rotation = np.stack([[np.cos(a), 0, -np.sin(a)], [0, -1, 0], -toward])
     translation = -rotation @ (100 * toward)
     camera = np.array(
-        [*rotation.ravel(), *translation, 150.0, size[1] / 2, size[0] / 2], np.float64
+        [*rotation.ravel(), *translation, focal, size[1] / 2, size[0] / 2], np.float64
     )
     rng = np.random.default_rng(seed)
     plain = np.zeros(size, np.float32)
     return Photo(
-        index=0, camera=camera, size=size, density=1.5,
+        index=0, camera=camera, size=size, density=focal / 100,
         image=np.zeros((*size, 3), np.float32),
         texture=rng.normal(size=size).astype(np.float32),
         upper=plain, lower=plain, upper_gum=plain, lower_gum=plain, dull=plain + 1,

@@ -9,12 +9,29 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from stages.init.dental.surface.chart.crown_shape import JawShape, tooth_of_columns
-from stages.init.dental.surface.chart.grid import MEAN_RADIUS, ChartGrid
+from stages.init.dental.surface.chart.crown_shape import (
+    JawShape,
+    crown_points,
+    crown_radius,
+    jaw_shape,
+    tooth_of_columns,
+    within_crowns,
+)
+from stages.init.dental.surface.chart.grid import MEAN_RADIUS, ChartGrid, grid_around
+from stages.init.dental.surface.chart.jaws import (
+    FACING_SMOOTHING,
+    Chart,
+    facing,
+    nearest_depths,
+    smooth_normals,
+)
+from stages.init.dental.surface.chart.partial import partial_crowns
+from stages.init.dental.surface.chart.raster import raster_chart
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
 from stages.init.dental.surface.options import SurfaceOptions
+from stages.init.dental.surface.photos.photo import Photo
 from tests.stages.dental_arch_scene import outline, pieces, scene
-from tests.stages.dental_surface_case import row_of_teeth
+from tests.stages.dental_surface_case import photo, row_of_teeth
 
 UPPER, GUM, TOOTH = 1, 1, 2
 #: Columns of the photographs: 21 of the one from the right is 118 to 136 wide, of that from the
@@ -87,6 +104,42 @@ def test_where_no_photograph_shows_it_whole_it_stays() -> None:
 def test_with_exact_cameras_it_stays() -> None:
     """There the light alone differs."""
     assert shown(surface((LIP, None, None), exact=True), 0, FAR_21) > 0.95
+
+
+def test_a_flank_is_left_to_the_photograph_that_it_is_turned_to() -> None:
+    """One from the left, in which a lip covers most of 11."""
+    shape = jaw_shape("upper", row_of_teeth(), {13, 12, 11, 21, 22, 23}, set())
+    assert shape is not None
+    points = crown_points(shape, 2.0, 2.0)
+    grid = grid_around(points, 2.0, 5.0)
+    radius = crown_radius(grid, points, 0.3)
+    chart = Chart(shape, grid, radius, np.zeros(grid.shape, np.float32))
+    front, side = (photo(yaw, size=(300, 500), focal=700.0) for yaw in (0.0, 35.0))
+    columns = tooth_of_columns(grid, shape)
+    lip = float(np.quantile(grid.arcs[columns == 11], 0.7))
+    photos = []
+    for each, covered in ((front, False), (side, True)):
+        depth, place = raster_chart(each, chart.points, within_crowns(grid, shape))
+        arcs = grid.left + place[..., 0] / grid.density
+        crowns = (depth > 0) & ~(covered & (arcs < lip))
+        photos.append(dataclasses.replace(each, upper=crowns.astype(np.float32)))
+    nearest = nearest_depths([chart], photos, 4.0, 1)
+    options = SurfaceOptions()
+    left_out = partial_crowns(chart, photos, nearest, options, 1)
+    assert not left_out[0].any()
+    (cut,) = set(columns[left_out[1].any(axis=0)]) - {13, 12}
+    assert cut == 11
+    normals = smooth_normals(chart.radius, grid, FACING_SMOOTHING)
+    turned = [facing(each, chart.points, normals) for each in photos]
+    crown = within_crowns(grid, shape) & (columns == 11)[None] & (photo_shows(photos[0], chart))
+    assert left_out[1][crown & (turned[0] > turned[1] + 0.05)].mean() > 0.95
+    flank = crown & (turned[1] > turned[0] + 0.05)
+    assert flank.sum() > 20 and not left_out[1][flank].any()
+
+
+def photo_shows(view: Photo, chart: Chart) -> npt.NDArray[np.bool_]:
+    """[H, W] bool: samples that lie within a crown in a photograph."""
+    return view.sample(view.upper, view.project(chart.points)[0]) > 0.5
 
 
 def test_columns_belong_to_the_tooth_between_its_boundaries() -> None:
