@@ -26,7 +26,7 @@ from stages.init.sfm.options import REFERENCE_SIDE, ClassicalOptions, Refinement
 from stages.init.sfm.reconstruct import Attempt, find_features, match_views, reconstruct
 from stages.init.sfm.triangulate import agreeing_matches, link_tracks, triangulate
 from stages.init.sfm.undistort import undistort_image
-from stages.photographs.detail import shows_nothing
+from stages.photographs.detail import BURNT_OUT, shows_nothing, white_share
 from stages.photographs.sharpness import UNSHARP, weakest_direction
 
 Progress = Callable[[str, int, int], None]
@@ -73,29 +73,33 @@ def place_classical(
     )  # fmt: skip
     names = [photo_name(view) for view in views]
     limits = Limits(min_views=least_views, max_error=options.max_reprojection_error * pixel)
-    unsharp, blank = _unsharp_and_blank(views, attempt)
-    diagnosis = failure(attempt, names, limits, unsharp, blank)
+    bad = _bad_ones(views, attempt)
+    diagnosis = failure(attempt, names, limits, *bad)
     if diagnosis:
         # All pairs that have any geometry: what is missing shows in the weak ones.
         links = replace(links_of(views, attempt), used=frozenset())
         drawn = match_pictures(links, pictures)
         raise ReconstructionError(diagnosis, drawn)
-    for text in warnings_of(attempt, names, unsharp, blank):
+    for text in warnings_of(attempt, names, *bad):
         warn(text)
     return _from_attempt(views, attempt)
 
 
-def _unsharp_and_blank(views: list[View], attempt: Attempt) -> tuple[list[int], list[int]]:
-    """Photographs that are shaken or out of focus, and those of an even surface and nothing else.
+def _bad_ones(views: list[View], attempt: Attempt) -> tuple[list[int], list[int], list[int]]:
+    """Photographs that are shaken or out of focus, those of an even surface and nothing else, and
+    those that lack detail as well and are white in good part.
 
     Asked only where some could not be placed.
     """
     if attempt.solution is not None and len(attempt.solution.poses) == len(views):
-        return [], []
+        return [], [], []
     greys = [view.gray().astype(np.float32) for view in views]
     blank = [k for k, grey in enumerate(greys) if shows_nothing(grey)]
-    soft = [k for k, grey in enumerate(greys) if weakest_direction(grey) < UNSHARP]
-    return [k for k in soft if k not in blank], blank
+    soft = [
+        k for k, grey in enumerate(greys) if k not in blank and weakest_direction(grey) < UNSHARP
+    ]
+    bright = [k for k in soft if white_share(greys[k]) > BURNT_OUT]
+    return [k for k in soft if k not in bright], blank, bright
 
 
 def links_of(views: list[View], attempt: Attempt) -> Links:

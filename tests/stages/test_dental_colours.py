@@ -11,7 +11,12 @@ from pipeline.artifacts.views import View
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
-from stages.init.dental.numbering.confidence import Evidence, _stranger, same_mouth
+from stages.init.dental.numbering.confidence import (
+    Evidence,
+    _stranger,
+    _too_bright,
+    same_mouth,
+)
 from stages.init.dental.numbering.rivals import Margins
 from stages.init.dental.place import of_several_days, one_sitting
 
@@ -69,7 +74,8 @@ def test_brackets_are_not_the_colour_of_enamel() -> None:
 def test_a_photograph_without_gum_says_nothing() -> None:
     image, dentition = photograph()
     everything = SimpleNamespace(mask=np.ones((120, 200), bool), band_height=60.0)
-    assert distances((image, dentition), (image, everything)) == [ColourDistance(0.0, 0.0)] * 2
+    found = distances((image, dentition), (image, everything))
+    assert [(d.one_light, d.any_light) for d in found] == [(0.0, 0.0)] * 2
 
 
 def evidence(one_light: float, any_light: float, common: float, share: float) -> Evidence:
@@ -133,3 +139,11 @@ def test_a_sitting_is_some_minutes_and_days_are_several(
 def test_all_that_makes_a_photograph_a_stranger_is_named() -> None:
     told = _stranger("a.jpg", places_fit=False)
     assert all(cause in told for cause in ("another patient", "mirrored", "upside down"))
+
+
+def test_a_photograph_with_burnt_out_teeth_is_called_too_bright() -> None:
+    found = distances(photograph(), photograph(), photograph(gains=2.5))
+    assert max(d.white for d in found[:2]) < 0.01
+    told = _too_bright("abc", [d.white for d in found])
+    assert "far too bright is c (" in told and "less light" in told
+    assert not _too_bright("ab", [d.white for d in found[:2]])

@@ -106,6 +106,19 @@ def test_unsharp_photographs_are_said_first_and_not_called_too_far_apart():
     assert one.count("more than 35 degrees") == 1, "of the pair that is sharp"
 
 
+def test_a_photograph_that_is_far_too_bright_is_not_just_called_unsharp():
+    edges = {(0, 1): two_view(30, 0.3), (1, 2): two_view(20, 0.3)}
+    attempt = Attempt(None, evidence(edges=edges), False, False)
+    text = failure(attempt, NAMES, Limits(3, 2.0), bright=[2])
+    assert text.startswith("'left.jpg' has too little fine detail left")
+    assert "plain white in good part: far too bright" in text and "less light" in text
+    assert "shaken" not in text and text.count("more than 35 degrees") == 1
+    edges = {(0, 1): two_view(200), (1, 2): two_view(40, 0.3)}
+    attempt = Attempt(solution([0, 1]), evidence(edges=edges, linked=[(0, 1)]), True, True)
+    (text,) = warnings_of(attempt, NAMES, bright=[2])
+    assert "far too bright" in text and "35 degrees" not in text
+
+
 def test_an_unsharp_photograph_that_is_left_out_is_called_so():
     edges = {(0, 1): two_view(200), (1, 2): two_view(40, 0.3)}
     found = evidence(edges=edges, linked=[(0, 1)])

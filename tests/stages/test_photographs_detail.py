@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.photographs.detail import shows_nothing
+from stages.photographs.detail import BURNT_OUT, shows_nothing, white_share
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
 DATA = Path("/work/shared/data")
@@ -81,3 +81,8 @@ def test_real_photographs_show_something() -> None:
     if not DATA.is_dir():
         pytest.skip("the photographs are not here")
     check([*sorted((DATA / "triads").rglob("*.jpg")), *sorted((DATA / "castle").rglob("*.jpg"))])
+
+
+def test_light_that_is_far_too_strong_leaves_white() -> None:
+    grey = rounded(np.tile(np.linspace(0, 255, 200, dtype=np.float32), (50, 1)))
+    assert white_share(grey) < BURNT_OUT < white_share(rounded(1.5 * grey))

@@ -73,7 +73,7 @@ def least_views(count: int, fraction: float) -> int:
 
 def failure(
     attempt: Attempt, names: list[str], limits: Limits, unsharp: Sequence[int] = (),
-    blank: Sequence[int] = (),
+    blank: Sequence[int] = (), bright: Sequence[int] = (),
 ) -> str | None:  # fmt: skip
     """The diagnosis of an attempt as one paragraph, or None if the reconstruction is good.
 
@@ -81,22 +81,23 @@ def failure(
         names: how the user knows the photographs.
         unsharp: those that are shaken or out of focus; that is said first.
         blank: those that show an even surface and nothing else; that is said before.
+        bright: those that lack detail too, and are white in good part.
     """
-    found = _failure(attempt, names, limits, unsharp, blank)
+    found = _failure(attempt, names, limits, [*unsharp, *bright], blank)
     if found is None:
         return None
-    said = _bad_ones(names, unsharp, blank)
+    said = _bad_ones(names, unsharp, blank, bright)
     if len(names) - len(blank) < limits.min_views:
         return " ".join(said)  # the others could not do it, whatever they share
     return " ".join([*said, found])
 
 
-def _bad_ones(names: list[str], unsharp: Sequence[int], blank: Sequence[int]) -> list[str]:
+def _bad_ones(
+    names: list[str], unsharp: Sequence[int], blank: Sequence[int], bright: Sequence[int]
+) -> list[str]:
     """A part of a diagnosis for each way in which photographs are bad by themselves."""
-    return [
-        text([names[view] for view in views])
-        for text, views in ((_nothing_shown, blank), (_too_soft, unsharp)) if views
-    ]  # fmt: skip
+    ways = ((_nothing_shown, blank), (_too_bright, bright), (_too_soft, unsharp))
+    return [text([names[view] for view in views]) for text, views in ways if views]
 
 
 def _nothing_shown(names: list[str]) -> str:
@@ -105,6 +106,16 @@ def _nothing_shown(names: list[str]) -> str:
         f"{_listed(names)} {'shows' if one else 'show'} nothing to match: an even surface without "
         "detail, as of a bare wall, a covered lens or far too much light. Leave "
         f"{'it' if one else 'them'} out, or take {'it' if one else 'them'} again of the teeth."
+    )
+
+
+def _too_bright(names: list[str]) -> str:
+    one = len(names) == 1
+    return (
+        f"{_listed(names)} {'has' if one else 'have'} too little fine detail left to match, and "
+        f"{'is' if one else 'are'} plain white in good part: far too bright (or, before something "
+        f"white, not sharp). Take {'it' if one else 'them'} again with less light, a weaker flash "
+        "or a lower exposure, so that the teeth are not white all over."
     )
 
 
@@ -220,18 +231,22 @@ def _median_depth(solution: Solution) -> float:
 
 
 def warnings_of(
-    attempt: Attempt, names: list[str], unsharp: Sequence[int] = (), blank: Sequence[int] = ()
-) -> list[str]:
+    attempt: Attempt, names: list[str], unsharp: Sequence[int] = (), blank: Sequence[int] = (),
+    bright: Sequence[int] = (),
+) -> list[str]:  # fmt: skip
     """What the user should know of a reconstruction that stands: views left out, and a guess.
 
     Args:
         names: how the user knows the photographs.
         unsharp: those that are shaken or out of focus.
         blank: those that show an even surface and nothing else.
+        bright: those that lack detail too, and are white in good part.
     """
     solution = attempt.solution
     if solution is None:
         return []
+    ways = (unsharp, blank, bright)
+    bad = [view for views in ways for view in views]
     unplaced = [view for view in range(len(names)) if view not in solution.poses]
     result = []
     if unplaced:
@@ -240,9 +255,9 @@ def warnings_of(
         said = [
             f"{len(unplaced)} of {len(names)} photographs could not be placed and are left out: "
             f"{_listed([names[view] for view in unplaced])}.",
-            *_bad_ones(names, *([v for v in unplaced if v in bad] for bad in (unsharp, blank))),
+            *_bad_ones(names, *([v for v in unplaced if v in way] for way in ways)),
             *(
-                _why_unplaced(attempt.evidence, names, view, placed, [*unsharp, *blank])
+                _why_unplaced(attempt.evidence, names, view, placed, bad)
                 for view in shown[:MOST_NAMED]
             ),
         ]

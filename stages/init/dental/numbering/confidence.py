@@ -14,7 +14,7 @@ from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.colours import ColourDistance
+from stages.init.dental.numbering.colours import BURNT_OUT, ColourDistance
 from stages.init.dental.numbering.labellings.scorer import (
     MAIN_ROLES,
     Scored,
@@ -184,7 +184,8 @@ def fit_doubts(
     # One photograph of another patient makes all three strangers to each other: the worst is named.
     if one.sureness < 0 and not known:
         fit = evidence.common_mouth[one.odd] > options.common_mouth_by_chance
-        doubts.append(_stranger(photos[one.odd], places_fit=fit))
+        white = [colour.white for colour in evidence.colours]
+        doubts.append(_stranger(photos[one.odd], places_fit=fit) + _too_bright(photos, white))
     for view, factor in evidence.mirrored.items():
         figures[f"mirrored_{view}"] = factor
         if factor > PERHAPS_MIRRORED:
@@ -224,6 +225,27 @@ def _stranger(photo: str, places_fit: bool) -> str:
     return (
         f"{photo} may show another patient, or a picture that was mirrored or is upside down: its "
         "colours and the places of its teeth fit the others' badly"
+    )
+
+
+def _too_bright(photos: Sequence[str], white: Sequence[float]) -> str:
+    """What to add of photographs whose teeth are burnt out: that alone changes colours.
+
+    Args:
+        white: of each, the share of its teeth that is as bright as a highlight.
+    """
+    burnt = [
+        f"{photo} ({100 * share:.0f} % of its teeth are plain white)"
+        for photo, share in zip(photos, white, strict=True)
+        if share > BURNT_OUT
+    ]
+    if not burnt:
+        return ""
+    one = len(burnt) == 1
+    return (
+        f"; far too bright {'is' if one else 'are'} {' and '.join(burnt)}, which alone changes "
+        f"colours: take {'it' if one else 'them'} again with less light, a weaker flash or a lower "
+        "exposure"
     )
 
 
