@@ -94,20 +94,20 @@ def in_cells(make: Callable[..., Picture]) -> Callable[[Sequence[Picture]], Pict
     return lambda pictures: make(*(filling(picture, 640, 480) for picture in pictures))
 
 
-#: Name -> (what makes the sheet, whether the photographs on it touch).
-LAYOUTS: dict[str, tuple[Callable[[Sequence[Picture]], Picture], bool]] = {
-    "row, bands of 2": (in_cells(lambda *p: grid([p], 2, WHITE)), False),
-    "row, black bands of 6": (in_cells(lambda *p: grid([p], 6, BLACK)), False),
-    "row, bands of 20 and around": (in_cells(lambda *p: grid([p], 20, WHITE, rim=20)), False),
-    "row, touching": (in_cells(lambda *p: grid([p], 0, WHITE)), True),
-    "column, black bands of 5": (in_cells(lambda *p: grid([[q] for q in p], 5, BLACK)), False),
-    "column, touching": (in_cells(lambda *p: grid([[q] for q in p], 0, BLACK)), True),
-    "pyramid": (in_cells(lambda r, f, l: grid([[f], [r, l]], 8, WHITE)), False),
-    "slide with a title": (lambda p: slide(p, title=True), False),
-    "slide, round corners": (lambda p: slide(p, round_corners=True), False),
-    "slide, shadows": (lambda p: slide(p, shadows=True), False),
-    "slide, gradient": (lambda p: slide(p, gradient=True), False),
-    "window with a sidebar": (lambda p: slide(p, sidebar=True), False),
+#: Name -> what makes the sheet.
+LAYOUTS: dict[str, Callable[[Sequence[Picture]], Picture]] = {
+    "row, bands of 2": in_cells(lambda *p: grid([p], 2, WHITE)),
+    "row, black bands of 6": in_cells(lambda *p: grid([p], 6, BLACK)),
+    "row, bands of 20 and around": in_cells(lambda *p: grid([p], 20, WHITE, rim=20)),
+    "row, touching": in_cells(lambda *p: grid([p], 0, WHITE)),
+    "column, black bands of 5": in_cells(lambda *p: grid([[q] for q in p], 5, BLACK)),
+    "column, touching": in_cells(lambda *p: grid([[q] for q in p], 0, BLACK)),
+    "pyramid": in_cells(lambda r, f, l: grid([[f], [r, l]], 8, WHITE)),
+    "slide with a title": lambda p: slide(p, title=True),
+    "slide, round corners": lambda p: slide(p, round_corners=True),
+    "slide, shadows": lambda p: slide(p, shadows=True),
+    "slide, gradient": lambda p: slide(p, gradient=True),
+    "window with a sidebar": lambda p: slide(p, sidebar=True),
 }
 
 
@@ -122,18 +122,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     data = parser.parse_args().data
     cases = list(triads(data))
-    for name, (make, touching) in LAYOUTS.items():
-        alone = beside = total = 0
+    for name, make in LAYOUTS.items():
+        cut = total = 0
         for pictures in cases:
             sheet = make(pictures)
             for quality in QUALITIES:
                 packed = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
                 decoded = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
-                alone += len(photographs_in(decoded, touching=True)) == len(pictures)
-                beside += len(photographs_in(decoded)) == len(pictures)
+                cut += len(photographs_in(decoded)) == len(pictures)
                 total += 1
-        others = "" if touching else f", {beside} beside other pictures"
-        print(f"{name:28} of {total} cut into three: {alone} alone{others}")
+        print(f"{name:28} of {total} cut into three: {cut}")
     paths = [path for pattern in SINGLE for path in sorted(data.glob(pattern))]
     counts: list[int] = []
     borders = 0
@@ -141,7 +139,7 @@ def main() -> None:
         single = cv2.imread(str(path))
         if single is None:
             continue
-        found = photographs_in(np.asarray(single), touching=True)
+        found = photographs_in(np.asarray(single))
         counts.append(len(found))
         borders += len(found) == 1 and found[0] != (0, 0, *single.shape[:2])
     cut = sum(count > 1 for count in counts)

@@ -66,8 +66,7 @@ def load_photos(
         files: label -> image file.
         masks: label of an image -> mask file.
         long_side, min_side: of the result, pixels.
-        cut_sheets: cut pictures into the photographs they hold (`photographs_in`); those that touch
-            are looked for where there is one file only.
+        cut_sheets: cut pictures into the photographs they hold (`photographs_in`).
         threads: how many to decode at a time; memory grows with it.
         progress: called with (done, total).
         warn: called with what is not taken of a file that is used.
@@ -87,7 +86,7 @@ def load_photos(
             whole = Box(0, 0, *photo.rgb.shape[:2])
             boxes = [whole]
             if cut_sheets:
-                boxes = photographs_in(photo.rgb, touching=len(files) == 1)
+                boxes = photographs_in(photo.rgb)
             if len(boxes) > 1:  # a banner across a sheet is left out
                 boxes = [box for box in boxes if _fitting(box, fits)] or [whole]
             if len(boxes) == 1:

@@ -49,42 +49,34 @@ FEW, MANY = 24, 600
 DEEPEST = 8
 
 
-def photographs_in(rgb: Bytes, *, touching: bool = False) -> list[Box]:
-    """Where the photographs of a picture are, in reading order; the whole where it is one.
-
-    Args:
-        rgb: [H, W, 3].
-        touching: look for photographs without a band between them as well.
-    """
+def photographs_in(rgb: Bytes) -> list[Box]:
+    """Where the photographs of a picture [H, W, 3] are, in reading order; the whole where it is
+    one."""
     whole = Box(0, 0, *rgb.shape[:2])
-    parts = _parts(rgb, whole, touching)
+    parts = _parts(rgb, whole)
     if len(parts) == 1:
         return parts if _has_border(rgb, parts[0]) else [whole]
     if sum(np.mean(_rim(rgb, part)) >= RIM for part in parts) < 2:
         return [whole]
-    if not touching:  # a narrow band that JPEG has spoiled is still a seam
-        parts = _parts(rgb, whole, True)
     largest = max(part.short_side for part in parts)
     return [part for part in parts if part.short_side >= SMALLEST * largest]
 
 
-def _parts(
-    rgb: Bytes, box: Box, touching: bool, depth: int = 0, axes: tuple[int, ...] = (0, 1)
-) -> list[Box]:
+def _parts(rgb: Bytes, box: Box, depth: int = 0, axes: tuple[int, ...] = (0, 1)) -> list[Box]:
     """What the bands and seams of a part of the picture, across these axes, leave of it."""
     if box.short_side < LEAST:
         return []
     for axis in axes:
         lines = box.of(rgb) if axis == 0 else box.of(rgb).swapaxes(0, 1)
         pieces, by_seams = _between_bands(lines), False
-        if touching and pieces == [(0, len(lines))]:
+        if pieces == [(0, len(lines))]:
             pieces, by_seams = _between_seams(lines), True
         if pieces == [(0, len(lines))] or depth == DEEPEST:
             continue
         found: list[tuple[Box, list[Box]]] = []
         for start, end in pieces:
             piece = _piece(box, axis, start, end)
-            parts = _parts(rgb, piece, touching, depth + 1)
+            parts = _parts(rgb, piece, depth + 1)
             if found and found[-1][1] and parts and not by_seams:
                 before, earlier = found[-1]
                 rims = [_side(rgb, part, axis, 1) or 0 for part in earlier]
@@ -92,7 +84,7 @@ def _parts(
                 if max(rims) < RIM:  # a plain stretch of one photograph
                     found.pop()
                     piece = Box(before.top, before.left, piece.bottom, piece.right)
-                    parts = _parts(rgb, piece, touching, depth + 1, axes[axis + 1 :])
+                    parts = _parts(rgb, piece, depth + 1, axes[axis + 1 :])
             found.append((piece, parts))
         return [part for _, parts in found for part in parts]
     return [box]

@@ -60,7 +60,7 @@ class ViewsStage(Stage):
     """Decode, turn upright, resize, and note how each view relates to its file."""
 
     name: ClassVar[str] = "views"
-    version: ClassVar[int] = 12
+    version: ClassVar[int] = 13
     summary: ClassVar[str] = "read photographs or a video and bring them to one working size"
     Config: ClassVar[type[StageConfig]] = ViewsConfig
     provides: ClassVar[tuple[str, ...]] = ("views",)

@@ -94,14 +94,12 @@ def test_photographs_with_shadows() -> None:
         np.testing.assert_allclose(box, (top, left, top + 150, left + 200), atol=16)
 
 
-def test_photographs_that_touch_are_cut_where_they_are_looked_for() -> None:
+def test_photographs_that_touch_are_cut() -> None:
     pixels = as_jpeg(sheet([(0, 0), (200, 0), (400, 0)], (600, 150), WHITE), 80)
-    whole = [(0, 0, 150, 600)]
-    assert photographs_in(pixels) == whole
-    assert photographs_in(pixels, touching=True) == [
+    assert photographs_in(pixels) == [
         (0, 0, 150, 200), (0, 200, 150, 400), (0, 400, 150, 600),
     ]  # fmt: skip
-    assert photographs_in(photograph(1), touching=True) == [(0, 0, 150, 200)]
+    assert photographs_in(photograph(1)) == [(0, 0, 150, 200)]
 
 
 def test_a_border_is_cut_off() -> None:
@@ -124,7 +122,7 @@ def test_things_before_a_plain_wall_are_one_photograph() -> None:
     for centre in (130, 370):
         ball = np.hypot(v - 150, u - centre) < 100
         pixels[ball] = np.resize(photograph(centre, 500, 300), (300, 500, 3))[ball]
-    assert photographs_in(pixels, touching=True) == [(0, 0, 300, 500)]
+    assert photographs_in(pixels) == [(0, 0, 300, 500)]
     assert photographs_in(np.full((90, 120, 3), 7, np.uint8)) == [(0, 0, 90, 120)]
 
 
