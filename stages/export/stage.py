@@ -32,7 +32,7 @@ class ExportStage(Stage):
     """Writes splats, COLMAP model, nerfstudio cameras, mesh, video, viewer page and preview."""
 
     name = "export"
-    version = 26
+    version = 27
     summary = "viewer page, splats, mesh, video, COLMAP model, nerfstudio cameras and the teeth"
     Config = ExportConfig
     requires = ("views", "cameras", "gaussians")

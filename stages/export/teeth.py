@@ -15,6 +15,7 @@ from pipeline.artifacts.dental.fdi import is_primary, is_upper, universal_number
 from pipeline.artifacts.space.scale import Scale
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth, filled
 from pipeline.artifacts.views import View, Views
+from stages.dentition.overlay import DOUBT_SHOWN
 from stages.dentition.working import outline_in_view
 from stages.splatting.rendering import RenderedView
 
@@ -25,6 +26,9 @@ FORMAT = "dentalsplat teeth 1"
 LEAST_ALPHA = 0.5
 #: A crown needs depth at so many of its pixels to be placed.
 LEAST_PIXELS = 4
+#: Of a crown that goes on unseen a photograph shows a strip if that is a smaller share of the
+#: pixels than where most of the crown is seen.
+LEAST_PART = 0.5
 #: Decimals of pixels and probabilities; of places, so many significant digits of their size.
 _PIXEL_DECIMALS, _DOUBT_DECIMALS, _PLACE_DIGITS = 2, 4, 6
 #: What another photograph is called in a reason, whatever name stands there.
@@ -35,9 +39,10 @@ NOTES = {
     "universal": "Universal numbering system: 1-32 permanent, A-T primary",
     "doubt": "0..1, that the number is wrong: of a tooth, the least of its photographs",
     "centre": "middle of what the photographs show of the crown's front, in the frame of all "
-    "exports (scene.json); null: nothing is known of its depth",
+    "exports (scene.json); photographs that show a strip of it, or whose number is doubtful, count "
+    "only where no other one shows it; null: nothing is known of its depth",
     "spread": "largest distance between that middle as single photographs have it and the centre; "
-    "null: one photograph at most",
+    "null: one photograph at most that counts",
     "width, height": "of the crown along and across its row, at its depth, in the photograph that "
     "shows most of it: it is foreshortened there, so the tooth has at least that; null: no "
     "photograph shows all of it",
@@ -58,6 +63,7 @@ class SeenCrown:
         centre: [3] median of the surface inside the outline, frame of the exports, or None.
         pixels: where it has depth.
         width, height: in units of the exports, as this photograph shows them, or None.
+        whole: neither side of it goes on unseen.
     """
 
     photograph: str
@@ -68,6 +74,7 @@ class SeenCrown:
     pixels: int
     width: float | None = None
     height: float | None = None
+    whole: bool = True
 
 
 def describe_teeth(
@@ -132,7 +139,8 @@ def _seen_crowns(
         width, height = _seen_size(crown, dentition, view, camera, centre)
         found.append(
             SeenCrown(
-                camera.name, crown.number, crown.doubt, outline, centre, pixels, width, height
+                camera.name, crown.number, crown.doubt, outline, centre, pixels, width, height,
+                whole=not (crown.cut_left or crown.cut_right),
             )
         )  # fmt: skip
     return found
@@ -183,13 +191,21 @@ def joint_centre(crowns: Sequence[SeenCrown]) -> tuple[Array | None, float | Non
     """[3] mean of a tooth's centres by the pixels that show it, and how far they lie from it.
 
     Where two crowns of a photograph carry the number, one is another tooth: the surer one counts.
-    The distance is None with fewer than two centres, both with none.
+    A strip of a crown has another middle, and what carries the number doubtfully may be another
+    tooth: both count only where no photograph shows the tooth better. The distance is None with
+    fewer than two centres, both with none.
     """
     surest: dict[str, SeenCrown] = {}
     for crown in sorted(crowns, key=lambda crown: (crown.doubt, -crown.pixels)):
         if crown.centre is not None:
             surest.setdefault(crown.photograph, crown)
     known = [crown for crown in crowns if surest.get(crown.photograph) is crown]
+    most = max((crown.pixels for crown in known), default=0)
+    known = [
+        crown
+        for crown in known
+        if (crown.whole or crown.pixels >= LEAST_PART * most) and crown.doubt <= DOUBT_SHOWN
+    ] or known
     if not known:
         return None, None
     centres = np.array([crown.centre for crown in known])

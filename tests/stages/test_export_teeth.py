@@ -223,6 +223,23 @@ def test_centres_count_by_the_pixels_that_show_the_crown() -> None:
     np.testing.assert_allclose(centre, [1, 0, 0])
 
 
+def test_a_strip_of_a_crown_and_a_doubtful_number_do_not_move_a_tooth() -> None:
+    def seen(photograph, x, pixels, doubt=0.0, whole=True):
+        return SeenCrown(
+            photograph, 13, doubt, np.zeros((3, 2)), np.array([x, 0.0, 0]), pixels, whole=whole
+        )
+
+    first, second = seen("000", 0.0, 300), seen("001", 1.0, 300)
+    for strip in (seen("002", 9.0, 20, whole=False), seen("002", 9.0, 300, doubt=0.3)):
+        centre, spread = joint_centre([first, second, strip])
+        np.testing.assert_allclose(centre, [0.5, 0, 0])
+        assert spread == pytest.approx(0.5)
+        np.testing.assert_allclose(joint_centre([strip])[0], [9, 0, 0])
+    # the last tooth of a row goes on unseen where it is seen best
+    centre, _ = joint_centre([seen("000", 0.0, 300, whole=False), seen("001", 4.0, 100)])
+    np.testing.assert_allclose(centre, [1, 0, 0])
+
+
 def undistorted(turned: bool) -> tuple[View, View]:
     """A picture whose colours are its places, and the same with the distortion taken out."""
     width, height = (90, 120) if turned else (120, 90)
