@@ -13,8 +13,8 @@ from stages.init.dental.numbering.arch_options import ArchOptions
 from stages.init.dental.numbering.colours import ColourDistance, colour_distances
 from stages.init.dental.numbering.confidence import (
     Evidence,
+    _badly_exposed,
     _stranger,
-    _too_bright,
     same_mouth,
 )
 from stages.init.dental.numbering.rivals import Margins
@@ -141,9 +141,11 @@ def test_all_that_makes_a_photograph_a_stranger_is_named() -> None:
     assert all(cause in told for cause in ("another patient", "mirrored", "upside down"))
 
 
-def test_a_photograph_with_burnt_out_teeth_is_called_too_bright() -> None:
+def test_a_photograph_with_far_too_much_or_too_little_light_is_called_so() -> None:
     found = distances(photograph(), photograph(), photograph(gains=2.5))
     assert max(d.white for d in found[:2]) < 0.01
-    told = _too_bright("abc", [d.white for d in found])
-    assert "far too bright is c (" in told and "less light" in told
-    assert not _too_bright("ab", [d.white for d in found[:2]])
+    told = _badly_exposed("abc", found)
+    assert "far too bright is c (" in told and "less light" in told and "darker" not in told
+    assert not _badly_exposed("ab", found[:2])
+    told = _badly_exposed("abc", distances(photograph(gains=0.25), photograph(), photograph()))
+    assert "far too dark is a (4.0 times darker than the others)" in told and "more light" in told

@@ -35,6 +35,9 @@ HIGHLIGHT = 95.0
 #: twelve patients: .31 at most but for one of .58; a stop too bright half have .76 or more, a stop
 #: and a half .83).
 BURNT_OUT = 0.5
+#: And one whose enamel has less than this share of the others' light was lit too little (the same
+#: photographs: .5 to 2).
+DARK_BESIDE = 0.4
 #: The gum looked at lies between these distances from the teeth (shares of the band).
 GUM_NEAR, GUM_FAR = 0.03, 0.12
 #: From the upper to the lower gum line, mm: median of eight patients with permanent teeth (12 to
@@ -67,11 +70,14 @@ class ColourDistance:
         one_light: if one light and one white balance took them all.
         any_light: whatever gain the camera gave each channel.
         white: share of its teeth that is as bright as a highlight.
+        light: of its enamel over the median of the others', in linear light; 1 where nothing can
+            be said.
     """
 
     one_light: float
     any_light: float
     white: float = 0.0
+    light: float = 1.0
 
 
 def tissue_colours(image: Image, dentition: Dentition, metal: Mask | None) -> Tissue | None:
@@ -150,9 +156,15 @@ def _distances(
             ColourDistance(
                 min(_distance(mine.lab, other.lab) for other in others),
                 min(_contrast_distance(mine, other) for other in others),
+                light=_light(mine) / max(float(np.median([_light(t) for t in others])), DARK),
             )
         )
     return result
+
+
+def _light(tissue: Tissue) -> float:
+    """Linear light of the enamel, of 0..1 (from its CIE lightness, but for the darkest)."""
+    return float(((tissue.lab[0] + 16) / 116) ** 3)
 
 
 def _distance(a: Array, b: Array) -> float:

@@ -14,7 +14,7 @@ from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
 from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.numbering.colours import BURNT_OUT, ColourDistance
+from stages.init.dental.numbering.colours import BURNT_OUT, DARK_BESIDE, ColourDistance
 from stages.init.dental.numbering.labellings.scorer import (
     MAIN_ROLES,
     Scored,
@@ -184,8 +184,8 @@ def fit_doubts(
     # One photograph of another patient makes all three strangers to each other: the worst is named.
     if one.sureness < 0 and not known:
         fit = evidence.common_mouth[one.odd] > options.common_mouth_by_chance
-        white = [colour.white for colour in evidence.colours]
-        doubts.append(_stranger(photos[one.odd], places_fit=fit) + _too_bright(photos, white))
+        exposure = _badly_exposed(photos, evidence.colours)
+        doubts.append(_stranger(photos[one.odd], places_fit=fit) + exposure)
     for view, factor in evidence.mirrored.items():
         figures[f"mirrored_{view}"] = factor
         if factor > PERHAPS_MIRRORED:
@@ -228,25 +228,28 @@ def _stranger(photo: str, places_fit: bool) -> str:
     )
 
 
-def _too_bright(photos: Sequence[str], white: Sequence[float]) -> str:
-    """What to add of photographs whose teeth are burnt out: that alone changes colours.
-
-    Args:
-        white: of each, the share of its teeth that is as bright as a highlight.
-    """
-    burnt = [
-        f"{photo} ({100 * share:.0f} % of its teeth are plain white)"
-        for photo, share in zip(photos, white, strict=True)
-        if share > BURNT_OUT
+def _badly_exposed(photos: Sequence[str], colours: Sequence[ColourDistance]) -> str:
+    """What to add of photographs with far too much or too little light: that changes colours."""
+    seen = list(zip(photos, colours, strict=True))
+    bright = [
+        f"{photo} ({100 * colour.white:.0f} % of its teeth are plain white)"
+        for photo, colour in seen
+        if colour.white > BURNT_OUT
     ]
-    if not burnt:
-        return ""
-    one = len(burnt) == 1
-    return (
-        f"; far too bright {'is' if one else 'are'} {' and '.join(burnt)}, which alone changes "
-        f"colours: take {'it' if one else 'them'} again with less light, a weaker flash or a lower "
-        "exposure"
-    )
+    dark = [
+        f"{photo} ({1 / max(colour.light, 0.01):.1f} times darker than the others)"
+        for photo, colour in seen
+        if colour.light < DARK_BESIDE and not bright
+    ]
+    told = ""
+    for which, what, more in ((bright, "bright", "less"), (dark, "dark", "more")):
+        if which:
+            told += (
+                f"; far too {what} {'is' if len(which) == 1 else 'are'} {' and '.join(which)}, "
+                f"which alone changes colours: take {'it' if len(which) == 1 else 'them'} again "
+                f"with {more} light or another exposure"
+            )
+    return told
 
 
 def _view_doubts(
