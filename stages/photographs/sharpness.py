@@ -26,12 +26,12 @@ COARSE, FINE = (0.06, 0.12), (0.12, 0.24)
 #: have .032 or more at 512 and 1024 pixels (95 % .041, half .08); with a blur of 1.5 pixels .008 to
 #: .038, shaken by 9 or 21 pixels .004 to .037 (half of them less than .02)
 UNSHARP = 0.035
-#: variance of rounding to whole levels, which `noise_level` does not see where all else is smooth
-ROUNDING = 1 / 12
-#: power of an octave over that of noise up to which it holds nothing: 84 real photographs have 390
-#: or more, with a tenth of the light 19, with noise of 10 levels 2; blurred by 12 pixels at 512 1.1
-#: at most, where the ratio of two octaves is that of their rounding
-ONLY_NOISE = 1.5
+#: power of an octave up to which it holds nothing: over that of noise, and by itself, for
+#: `noise_level` does not see rounding where all else is smooth, whose steps are coarse. 84 real
+#: photographs have 390 times their noise or more, with a tenth of the light 19, with noise of 10
+#: levels 2. Of twelve of them blurred by 8 to 21 pixels all have less than 1, with a twentieth of
+#: the light none has.
+ONLY_NOISE, ROUNDING = 1.5, 1.0
 
 
 def sharpness(grey: Floats) -> float:
@@ -58,7 +58,7 @@ def weakest_direction(grey: Floats) -> float:
     spectrum = np.abs(np.fft.rfft2((grey - grey.mean()) * window)) ** 2 / np.square(window).sum()
     noise = noise_level(grey) ** 2
     power = np.maximum(spectrum - noise, 0)
-    least = ONLY_NOISE * max(noise, ROUNDING)
+    least = max(ONLY_NOISE * noise, ROUNDING)
     down, right = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None]
     frequency = np.hypot(down, right)
     turn = (np.arctan2(down, right) % np.pi) / np.pi * DIRECTIONS
