@@ -133,20 +133,33 @@ def _plainness(pixels: Bytes, samples: int) -> Floats:
 
 def _between_seams(pixels: Bytes) -> list[tuple[int, int]]:
     """(start, end) of the lines between places where the picture jumps on nearly a whole line."""
-    grey = pixels[:, :: max(1, pixels.shape[1] // MANY)].mean(-1, dtype=np.float32)
-    jump = np.abs(np.diff(grey, axis=0))
-    around = np.pad(jump, ((BESIDE + 1, BESIDE + 1), (0, 0)))
-    places = (0, 1, 2 * BESIDE + 1, 2 * BESIDE + 2)
-    usual = np.max([around[place : place + len(jump)] for place in places], axis=0)
-    share = (jump > 2 * usual + 4).mean(1)
+    places = np.arange(len(pixels) - 1)
+    places = places[_jumps(pixels, places, FEW) >= SEAM / 2]
+    places = places[_jumps(pixels, places, MANY) >= SEAM]
     pieces = [(0, len(pixels))]
-    for place in np.flatnonzero(share >= SEAM).tolist():
+    for place in places.tolist():
         start, end = pieces[-1]
         if len(pieces) > 1 and place + 1 - start <= BESIDE:  # the other edge of a narrow band
             pieces[-1] = place + 1, end
         elif min(place + 1 - start, end - place - 1) >= LEAST:
             pieces[-1:] = [(start, place + 1), (place + 1, end)]
     return pieces
+
+
+def _jumps(pixels: Bytes, places: npt.NDArray[np.intp], samples: int) -> Floats:
+    """[K] shares of lines of [N, M, 3] from which the picture jumps to the next line, more than it
+    does nearby; by so many of their pixels."""
+    some = pixels[:, :: max(1, pixels.shape[1] // samples)]
+
+    def jump(lines: npt.NDArray[np.intp]) -> Floats:
+        there = (lines >= 0) & (lines < len(some) - 1)
+        first = np.where(there, lines, 0)
+        one, two = (some[line].mean(-1, dtype=np.float32) for line in (first, first + there))
+        return np.asarray(np.abs(two - one))
+
+    beside = (-BESIDE - 1, -BESIDE, BESIDE, BESIDE + 1)
+    usual = np.max([jump(places + aside) for aside in beside], axis=0)
+    return np.asarray((jump(places) > 2 * usual + 4).mean(1), np.float32)
 
 
 def _has_border(rgb: Bytes, box: Box) -> bool:
