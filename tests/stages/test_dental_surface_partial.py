@@ -65,7 +65,8 @@ def with_lips(edges: tuple[int | None, ...]):  # type: ignore[no-untyped-def]
 
 @functools.cache
 def surface(edges: tuple[int | None, ...], exact: bool = False) -> ArchSurface:
-    return dense_surface(*with_lips(edges), options=SurfaceOptions(only_clear=not exact), threads=2)
+    options = SurfaceOptions(rounds=(), only_clear=not exact)  # the crown shapes are near enough
+    return dense_surface(*with_lips(edges), options=options, threads=2)
 
 
 def crown(photo: int, columns: tuple[int, int]) -> npt.NDArray[np.bool_]:

@@ -117,9 +117,9 @@ def test_a_case_that_was_renamed_keeps_what_it_has(tmp_path: Path) -> None:
     for number, name in enumerate(("anna", "ben", "carl")):
         add_case(tmp_path, name, number, 10 + number)
 
-    def states(*arguments: str) -> dict[str, tuple[str, str]]:
+    def states() -> dict[str, tuple[str, str]]:
         (tmp_path / "log.txt").write_text("")
-        process = command(tmp_path, "--json", *arguments)
+        process = command(tmp_path, "--json")
         out, told = process.communicate(timeout=120)
         assert process.returncode == 0, told
         return {each["name"]: (each["id"], each["state"]) for each in json.loads(out)["cases"]}
