@@ -19,9 +19,11 @@ import numpy.typing as npt
 
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.chart.jaws import (
+    APART,
     FACING_SMOOTHING,
     HIDDEN,
     PAST_EDGE,
+    WITHIN,
     Chart,
     facing,
     smooth_normals,
@@ -34,10 +36,6 @@ from stages.init.dental.surface.photos.tissue import disc, joined_to
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-#: A place is on a crown if that goes on around it for so far (mm), and it is not in a photograph
-#: if that shows none so far around it. Landmarks of real photographs are off by .2 to .3 mm in the
-#: median; the surface by as much.
-_WITHIN, _APART = 0.5, 0.8
 #: Half the width of the narrowest thing that covers (mm).
 _NARROW = 0.5
 #: Share of a sample's surroundings from which it is tooth, or tissue.
@@ -113,15 +111,13 @@ def _look(chart: Chart, points: Array32, normals: Array32, shown: tuple[Photo, A
     pixels, _ = photo.project(points)
     seen = sees(photo, front, points, HIDDEN)
     seen &= photo.sample(photo.valid.astype(np.float32), pixels) > _HALF
-    tooth = np.maximum(photo.upper, photo.lower)
     gum = np.maximum(photo.upper_gum, photo.lower_gum)
-    away = cv2.distanceTransform((tooth == 0).astype(np.uint8), cv2.DIST_L2, 5)
-    bare = seen & (photo.sample(np.asarray(away), pixels) > _APART * photo.density)
+    bare = seen & (photo.sample(photo.away_from_teeth(), pixels) > APART * photo.density)
     crown = (seen & (photo.sample(photo.tooth_of(jaw), pixels) > _HALF)).astype(np.uint8)
     own, any_jaws = photo.sample(photo.gum_of(jaw), pixels), photo.sample(gum, pixels)
     return _Look(
         faces=np.where(seen, facing(photo, points, normals), np.float32(-1)),
-        crown=cv2.erode(crown, disc(round(_WITHIN * chart.grid.density))) > 0,
+        crown=cv2.erode(crown, disc(round(WITHIN * chart.grid.density))) > 0,
         bare=bare,
         beyond=bare & ((own > _HALF) | (any_jaws < _HALF)),
     )
@@ -147,7 +143,7 @@ def _marked(photo: Photo, covered: Mask, contested: Mask) -> Photo:
         return photo
     tooth = (photo.upper > 0) | (photo.lower > 0)
     gum = (photo.upper_gum > 0) | (photo.lower_gum > 0)
-    wide = cv2.dilate(covered.astype(np.uint8), disc(round(_APART * photo.density))) > 0
+    wide = cv2.dilate(covered.astype(np.uint8), disc(round(APART * photo.density))) > 0
     covered = wide & ~tooth
     covered |= _of_its_colour(photo, covered & gum, gum & ~covered, tooth) & contested
     covered |= gum & ~joined_to(tooth | (gum & ~covered), tooth)

@@ -17,10 +17,12 @@ import numpy.typing as npt
 from pipeline.kernels.threads import in_threads
 from stages.init.dental.surface.chart.crown_shape import tooth_of_columns, within_crowns
 from stages.init.dental.surface.chart.jaws import (
+    APART,
     FACING_SMOOTHING,
     HIDDEN,
     PAST_EDGE,
     ROW_SMOOTHING,
+    WITHIN,
     Chart,
     facing,
     smooth_normals,
@@ -33,10 +35,6 @@ from stages.init.dental.surface.photos.tissue import disc
 Array32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-#: A photograph is expected to show what lies so far (mm) within a crown that another one shows:
-#: landmarks are off by .2 to .3 mm in the median, the surface by as much. It is not there if no
-#: tooth is shown so far (mm) around it.
-_WITHIN, _APART = 0.5, 0.8
 #: A crown is cut off if so much of it is lacking. Of 532 crowns of eleven patients, each against a
 #: photograph that faces it better, two in three lack .03 at most, one in four .2 and more.
 _LACKING = 0.1
@@ -93,7 +91,7 @@ def partial_crowns(
     columns = tooth_of_columns(chart.grid, chart.shape)
     crowns = within_crowns(chart.grid, chart.shape)
     used = chart.used(PAST_EDGE, options.gum_height)
-    inset = disc(round(_WITHIN * chart.grid.density))
+    inset = disc(round(WITHIN * chart.grid.density))
     found = [np.zeros(chart.grid.shape, bool) for _ in photos]
     for tooth in chart.shape.teeth:
         own = (columns == tooth)[None]
@@ -123,10 +121,7 @@ def _sight(
     could = (faces > options.least_facing) & (clear | ~inside)
     tooth = could & (photo.sample(photo.tooth_of(jaw), pixels) > 0.5)
     gum = could & (photo.sample(photo.gum_of(jaw), pixels) > 0.5)
-    away = cv2.distanceTransform(
-        ((photo.upper == 0) & (photo.lower == 0)).astype(np.uint8), cv2.DIST_L2, 5
-    )
-    far = photo.sample(np.asarray(away, np.float32), pixels) > _APART * photo.density
+    far = photo.sample(photo.away_from_teeth(), pixels) > APART * photo.density
     bare = could & (far | ~inside)
     return _Sight(could, tooth, tooth | gum, bare, faces, facing(photo, points, row))
 

@@ -78,6 +78,11 @@ class Photo:
         """[H, W] float32 0 or 1: gum of this jaw."""
         return self.upper_gum if jaw == "upper" else self.lower_gum
 
+    def away_from_teeth(self) -> Array32:
+        """[H, W] float32: pixels to the nearest tooth of either jaw; 0 on one."""
+        none = ((self.upper == 0) & (self.lower == 0)).astype(np.uint8)
+        return np.asarray(cv2.distanceTransform(none, cv2.DIST_L2, 5), np.float32)
+
     @property
     def centre(self) -> Array64:
         """[3] position of the camera, mm."""
