@@ -252,14 +252,17 @@ def warmup_command() -> None:
 
     They are kept beside the program where that can be written, so that all users have them.
     """
+    from pipeline.config import load_config
     from pipeline.kernels import folder
     from pipeline.kernels.rehearsals import Background
     from pipeline.measure import usable_cores
     from pipeline.stage import usable_stages
 
+    # in the order of a run: the longest come before those that have to wait for their kernels
+    stages = dict.fromkeys([*load_config().run.stages, *usable_stages()])
     background = Background()
     try:
-        background.start(usable_stages(), processes=usable_cores())
+        background.start(stages, processes=usable_cores())
         well = background.wait()
     finally:
         background.stop()

@@ -1,8 +1,9 @@
 """Kernels compiled ahead: beside the first stages of a run, or for an image (`pipeline warmup`).
 
 A stage names its rehearsals: functions that run its kernels on something tiny. Compiling is one
-thread's work, so that they are shared out among processes; a kernel that two need is compiled by
-one. `python -m pipeline.kernels.rehearsals stages.fit.rehearsal:rasterizer` is such a process.
+thread's work, so that processes share them: `python -m pipeline.kernels.rehearsals LENGTH` is such
+a process, and holds one after the other until none is left in the pipe that they all read from. A
+kernel that two need is compiled by one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -37,10 +38,11 @@ class Background:
     def start(self, stages: Iterable[str], processes: int) -> None:
         """Begin; what can't be begun is left to the stages themselves."""
         waiting = missing(stages)
-        shares = [waiting[k::processes] for k in range(min(processes, len(waiting)))]
-        with contextlib.suppress(OSError):
-            for share in shares:
-                self._running.append(_process(share))
+        if not waiting:
+            return
+        with contextlib.suppress(OSError), _pipe_of(waiting) as (names, length):
+            for _ in range(min(processes, len(waiting))):
+                self._running.append(_process(names, length))
 
     def wait(self) -> bool:
         """Wait for all of them; did all go well?"""
@@ -80,7 +82,21 @@ def hold(name: str) -> None:
         places.tidy(folder, f"rehearsed.{name.replace(':', '.')}")
 
 
-def _process(names: Sequence[str]) -> subprocess.Popen[bytes]:
+@contextlib.contextmanager
+def _pipe_of(names: Sequence[str]) -> Iterator[tuple[int, int]]:
+    """The reading end of a pipe that ends after these names, and how many bytes each has there."""
+    records = [name.encode() for name in names]
+    length = max(map(len, records))
+    reading, writing = os.pipe()
+    try:
+        with open(writing, "wb") as end:
+            end.write(b"".join(record.ljust(length) for record in records))
+        yield reading, length
+    finally:
+        os.close(reading)
+
+
+def _process(names: int, length: int) -> subprocess.Popen[bytes]:
     here = str(Path(__file__).resolve().parents[2])
     environment = {
         **os.environ,
@@ -89,8 +105,8 @@ def _process(names: Sequence[str]) -> subprocess.Popen[bytes]:
         "NUMBA_NUM_THREADS": "1", **ONE_THREAD,
     }  # fmt: skip
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", __spec__.name, *names], env=environment,
-        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        [sys.executable, "-P", "-m", __spec__.name, str(length)], env=environment,
+        stdin=names, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
 
 
@@ -117,13 +133,13 @@ def _processor() -> str:
     return platform.processor()
 
 
-def main(names: Sequence[str]) -> None:
+def main(length: int) -> None:
     child()
     with contextlib.suppress(AttributeError):  # Windows has none
         os.nice(NICENESS)
-    for name in names:
+    while name := os.read(0, length).decode().strip():
         hold(name)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(int(sys.argv[1]))

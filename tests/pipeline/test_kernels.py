@@ -310,6 +310,28 @@ class TestRehearsals:
             module, _, function = name.partition(":")
             getattr(importlib.import_module(module), function)()
 
+    def test_processes_share_them_and_leave_none(self, tmp_path, monkeypatch):
+        (tmp_path / "toys.py").write_text(
+            "import os, pathlib, time\n"
+            "def note(name):\n"
+            "    time.sleep(0.2)\n"
+            "    pathlib.Path(name).write_text(str(os.getpid()))\n"
+            "def a(): note('a')\n"
+            "def much_longer(): note('much_longer')\n"
+            "def c(): note('c')\n"
+        )
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+        names = ["toys:a", "toys:much_longer", "toys:c"]
+        monkeypatch.setattr(rehearsals, "missing", lambda stages: names)
+        background = rehearsals.Background()
+        background.start(["toys"], processes=2)
+        assert background.wait()
+        held_by = [Path(name.partition(":")[2]).read_text() for name in names]
+        assert len(set(held_by)) == 2
+        assert len(list((tmp_path / "kept" / "dentalsplat").glob("rehearsed.toys.*"))) == 3
+
     def test_processes_end_with_the_run(self, tmp_path, monkeypatch):
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
         background = rehearsals.Background()
