@@ -89,7 +89,7 @@ def _pipe_of(names: Sequence[str]) -> Iterator[tuple[int, int]]:
     length = max(map(len, records))
     reading, writing = os.pipe()
     try:
-        with open(writing, "wb") as end:
+        with os.fdopen(writing, "wb") as end:
             end.write(b"".join(record.ljust(length) for record in records))
         yield reading, length
     finally:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import FILLED
-from pipeline.geometry.normals import depth_normals
+from pipeline.geometry.normals import UNSURE, depth_normals
 from pipeline.geometry.order import nearest_views
 from pipeline.kernels import each, helper, kernel, kernel_threads
 from stages.stereo.consistency import camera_table, stacked
@@ -234,7 +234,7 @@ def fuse(
             kept = (keep == 1) | ((keep == 2) & thinned)
             fill += int(((keep == 2) & thinned).sum())
             residuals.append(residual[(keep == 1) & (residual >= 0)])
-            normals = depth_normals(depths[v], confidences[v], camera)
+            normals = depth_normals(depths[v], np.maximum(confidences[v] - 1, UNSURE), camera)
             parts.append(
                 (
                     camera.unproject(depth)[kept].astype(np.float32),

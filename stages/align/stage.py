@@ -25,7 +25,7 @@ class AlignStage(Stage):
     """Bring all pointmaps into one world and fuse them."""
 
     name = "align"
-    version = 10
+    version = 11
     summary = "pairwise pointmaps to one world: cameras and one dense coloured cloud"
     Config = AlignConfig
     requires = ("views", "pointmaps")

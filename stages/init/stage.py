@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 62
+    version = 63
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

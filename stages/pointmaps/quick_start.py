@@ -15,7 +15,7 @@ from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
 from pipeline.geometry import cloud
 from pipeline.geometry.depths import view_depths
-from pipeline.geometry.normals import depth_normals
+from pipeline.geometry.normals import UNSURE, depth_normals
 from pipeline.geometry.start import start_from_tree
 from pipeline.geometry.world import move_camera, normalising_similarity
 
@@ -79,7 +79,7 @@ def quick_start(
     for view, camera in zip(placed, found, strict=True):
         confidence = np.where(view.valid(), depths[view.name].confidence, np.float32(1))
         depth = np.where(confidence > 1, scale * depths[view.name].depth, np.float32(0))
-        normals = depth_normals(depth, confidence, camera)
+        normals = depth_normals(depth, np.maximum(confidence - 1, UNSURE), camera)
         maps.append(depth)
         clouds.append(cloud.depth_points(view.image, depth, normals, confidence, camera))
     return QuickStart(

@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.confidence import COMPLETED
+from pipeline.geometry.normals import depth_normals
 from pipeline.geometry.order import nearest_views
 from pipeline.kernels import kernel_threads
 from stages.stereo.aggregate import aggregate, decide, edge_aware_penalty
-from stages.stereo.appearance import highlights, normals_from_depth, to_gray
+from stages.stereo.appearance import highlights, to_gray
 from stages.stereo.consistency import camera_table, check, stacked
 from stages.stereo.fill import complete, distance_to
 from stages.stereo.options import METHODS, DenseOptions, DenseView
@@ -341,7 +342,7 @@ def _finish(
             confidence = np.where(known | (filled <= 0), confidence, trust).astype(np.float32)
         merged = np.where(known, depth, filled)
         weight = np.where(known, np.float32(1), np.float32(0.01))
-        normal = normals_from_depth(merged, weight, cameras[index])
+        normal = depth_normals(merged, weight, cameras[index])
         result.append(DenseView(depth, confidence, normal, filled))
     return result
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.artifacts.confidence import COMPLETED
+from pipeline.geometry.normals import depth_normals
 from stages.stereo.aggregate import aggregate, decide
-from stages.stereo.appearance import highlights, normals_from_depth, to_gray
+from stages.stereo.appearance import highlights, to_gray
 from stages.stereo.fill import continued
 from stages.stereo.options import DenseOptions, DenseView
 from stages.stereo.polish import polish, source_maps
@@ -146,7 +147,7 @@ def test_normals_of_the_ball(three):
     centre &= found[1].depth > 0
     cosine = (found[1].normal * outward).sum(-1)[centre]
     assert np.median(cosine) > 0.95
-    exact = normals_from_depth(depths[1], np.ones_like(depths[1]), cameras[1], 1.0)
+    exact = depth_normals(depths[1], np.ones_like(depths[1]), cameras[1], 1.0)
     assert np.median((exact * outward).sum(-1)[38:58, 52:76]) > 0.995
 
 
