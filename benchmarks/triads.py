@@ -1,6 +1,6 @@
 """Real mouths: which cases become a scene, with which numbers, and what must not pass.
 
-    python benchmarks/triads.py --data DIR [--out DIR] [--only CASE,...] [--mixes N] [--fours N]
+    python benchmarks/triads.py --data DIR [--out DIR] [--only CASE,...] [--mixes N] [--larger N]
                                 [--series] [--pairs] [--leave-one-out] [--threads 2] [--jobs 1]
                                 [--set FIELD=VALUE ...]
 
@@ -8,13 +8,13 @@ DIR holds `triads/` (three photographs and `truth.json` per patient) and perhaps
 (everything that a clinic took). Each case goes through the stages views, teeth and init as on the
 command line (init.method=dental, or as --set says). --mixes adds up to N mixes (120: all six
 sorts) of which none may become a scene unless what is wrong is put right: sides swapped in the
-file names must pass like the case itself. --fours adds up to N of four photographs: three of a
-patient and one of another, which may become a scene without that one, and two of each. --pairs
-takes two photographs of each case instead, the front and one side, and as mixes all ways to put
-another patient's in, or to mirror one. --series gives whole folders. OUT gets `triads.json` with
-every figure, `curve.png`, contact sheets (`cases_*.png`, `turned_*.png`, `series_*.png`,
-`mixes_*.png`: mixes that were accepted) and `readings/`, which makes the next run quicker: readings
-count again where neither the photograph nor the reader has changed.
+file names must pass like the case itself. --larger adds up to N of four to six photographs: three
+of a patient and one or two of another, which may become a scene without these, and two or all three
+of each. --pairs takes two photographs of each case instead, the front and one side, and as mixes
+all ways to put another patient's in, or to mirror one. --series gives whole folders. OUT gets
+`triads.json` with every figure, `curve.png`, contact sheets (`cases_*.png`, `turned_*.png`,
+`series_*.png`, `mixes_*.png`: mixes that were accepted) and `readings/`, which makes the next run
+quicker: readings count again where neither the photograph nor the reader has changed.
 
 Found: a truth point lies inside a crown. Right: that crown has the point's number. A wrong number
 that is shown as doubtful is listed (with ?), but does not make a scene wrong. Points on crowns
@@ -40,13 +40,14 @@ from typing import Any
 
 import yaml
 from triads_data import (
+    BOTH,
     CASE,
-    FOURS,
+    LARGER,
     SERIES,
     SORTS,
     SWAPPED,
     Item,
-    make_fours,
+    make_larger,
     make_mixed_pairs,
     make_mixes,
     make_pairs,
@@ -168,7 +169,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         result["series_chosen_right"] = sum(row["chosen_right"] for row in series)
         result["series_accepted"] = sum(row["accepted"] for row in series)
     accepted = {row["name"]: row["accepted"] for row in cases}
-    for sort in (*SORTS, *FOURS):
+    for sort in (*SORTS, *LARGER):
         mixes = [row for row in rows if row["sort"] == sort]
         if not mixes:
             continue
@@ -177,6 +178,8 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
             "accepted": sum(row["accepted"] for row in mixes),
             "accepted_wrong": sum(row["accepted"] and is_wrong(row) for row in mixes),
         }
+        if sort == BOTH:
+            result[sort]["told"] = sum("of two patients" in row["why_not"] for row in mixes)
         if sort == SWAPPED:
             same = sum(row["accepted"] == accepted.get(row["patients"][0]) for row in mixes)
             result[sort]["as_unswapped"] = same
@@ -305,7 +308,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for figures, pictures and readings")
     parser.add_argument("--only", default="", help="cases, with commas between them")
     parser.add_argument("--mixes", type=int, default=0, metavar="N", help="so many mixes too")
-    parser.add_argument("--fours", type=int, default=0, metavar="N", help="so many of four photos")
+    parser.add_argument("--larger", type=int, default=0, metavar="N", help="so many of four to six")
     parser.add_argument("--pairs", action="store_true", help="the front and one side alone")
     parser.add_argument("--series", action="store_true", help="whole folders too")
     parser.add_argument("--leave-one-out", action="store_true", help="print it for the thresholds")
@@ -333,13 +336,13 @@ def run(options: argparse.Namespace, folder: Path) -> None:
     if options.series:
         print(f"\n{SERIES_HEAD}")
         results.add(run_items(runner, series, 1), series_line, folder)
-    if options.mixes or options.fours:
+    if options.mixes or options.larger:
         mixes = (
             make_mixed_pairs(cases)[: options.mixes]
             if options.pairs
             else make_mixes(cases, series, options.mixes)
         )
-        mixes += make_fours(cases, options.fours)
+        mixes += make_larger(cases, options.larger)
         print(f"\n{len(mixes)} mixes:")
         # A coarse surface will do: only whether there is one counts.
         coarse = settings_of([*options.set, "dental.chart_density=5", "dental.cloud_spacing=1.0"])

@@ -15,13 +15,16 @@ SLOTS = ("0_right", "1_frontal", "2_left")
 OPEN = ("right_open", "front_open", "left_open")
 #: Photographs of a series that belong in a scene; of the fronts one is enough.
 SIDES, FRONTS = frozenset({"0_right", "2_left"}), frozenset({"1_frontal", "front_b"})
-#: Sorts of items. Those in `SORTS` are mixes of three photographs, those in `FOURS` of four.
+#: Sorts of items. Those in `SORTS` are mixes of three photographs, those in `LARGER` of more.
 CASE, SERIES = "case", "series"
 ALIEN, TWO, MIRRORED_SIDE, MIRRORED_FRONT, SWAPPED, APART = SORTS = (
     "one of another patient", "sides of another patient", "one side mirrored", "frontal mirrored",
     "sides swapped", "jaws apart",
 )  # fmt: skip
-BESIDE, HALVES = FOURS = "another patient's beside three", "two of each of two patients"
+BESIDE, HALVES, TWO_BESIDE, BOTH = LARGER = (
+    "another patient's beside three", "two of each of two patients",
+    "two of another patient's beside three", "all of two patients",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class Item:
 
     Attributes:
         name: unique.
-        sort: `CASE`, `SERIES` or one of `SORTS` and `FOURS`.
+        sort: `CASE`, `SERIES` or one of `SORTS` and `LARGER`.
         photos: in the order in which they are given.
     """
 
@@ -188,10 +191,11 @@ def make_mixes(cases: list[Item], series: list[Item], count: int, seed: int = 0)
     return mixes[:count]
 
 
-def make_fours(cases: list[Item], count: int, seed: int = 0) -> list[Item]:
-    """At most `count` mixes of four, of either sort in turn; fewer are the beginning of more.
+def make_larger(cases: list[Item], count: int, seed: int = 0) -> list[Item]:
+    """At most `count` mixes of four to six, of every sort in turn; fewer are the beginning of more.
 
-    Of the first sort the three that belong together may become a scene, without the fourth.
+    Where three belong together they may become a scene without the others. Where both patients have
+    all three, it is to be said.
     """
     rng = np.random.default_rng(seed)
     ring = [cases[k] for k in rng.permutation(len(cases))]
@@ -199,17 +203,22 @@ def make_fours(cases: list[Item], count: int, seed: int = 0) -> list[Item]:
     for step in range(1, len(ring)):
         for k, case in enumerate(ring):
             other = ring[(k + step) % len(ring)]
-            more = replace(other.photos[(k + step) % 3], shown="3")
-            name = f"{case.name} and {other.name}/{more.path.stem}"
-            mixes.append(Item(f"{name} ({BESIDE})", BESIDE, (*case.photos, more)))
-            own, others = (
-                tuple(photo for slot, photo in enumerate(one.photos) if slot != (k + skipped) % 3)
-                for one, skipped in ((case, 0), (other, step))
-            )
-            named = tuple(replace(p, shown=f"{n}") for n, p in enumerate(others, 3))
-            name = " and ".join(f"{p.patient}/{p.path.stem}" for p in (*own, *others))
-            mixes.append(Item(f"{name} ({HALVES})", HALVES, (*own, *named)))
+            others = _but_one(other, k + step)
+            for sort, mine, added in (
+                (BESIDE, case.photos, (other.photos[(k + step) % 3],)),
+                (HALVES, _but_one(case, k), others),
+                (TWO_BESIDE, case.photos, others),
+                (BOTH, case.photos, other.photos),
+            ):
+                more = tuple(replace(p, shown=f"{n}") for n, p in enumerate(added, len(mine)))
+                name = " and ".join(f"{p.patient}/{p.path.stem}" for p in (*mine, *more))
+                mixes.append(Item(f"{name} ({sort})", sort, (*mine, *more)))
     return mixes[:count]
+
+
+def _but_one(case: Item, slot: int) -> tuple[Photo, ...]:
+    """The photographs of a case without one of its three."""
+    return tuple(photo for k, photo in enumerate(case.photos) if k != slot % 3)
 
 
 def _with(

@@ -26,7 +26,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 63
+    version = 64
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)
@@ -182,6 +182,7 @@ def _from_features(context: StageContext, views: Views) -> None:
     """By features, or by teeth where these link photographs that features don't."""
     from pipeline.kernels.threads import side_by_side
     from stages.init.dental.choice import ByTeeth, neither
+    from stages.init.dental.odd_ones import SeveralMouthsError
     from stages.init.dental.read import turned_as_said, without_left_out
     from stages.init.place import place_classical, with_focals
     from stages.init.sfm.diagnosis import least_views
@@ -223,6 +224,8 @@ def _from_features(context: StageContext, views: Views) -> None:
         context.progress("features do not link the photographs; trying the teeth", 0, 1)
         try:
             by_teeth.place()
+        except SeveralMouthsError:
+            raise  # between two mouths there is no texture in common
         except ReconstructionError as doubtful:
             raise neither(unplaced, doubtful) from doubtful
         return

@@ -30,6 +30,7 @@ class Turned:
         mirrored: which were turned back.
         left_out: which take no part, for the others agree without them (`odd_ones`).
         reasons: the doubts about a fit with those that were left out.
+        mouths: one or two sets of photographs that agree each by itself, but not with the others.
     """
 
     views: list[View]
@@ -38,6 +39,7 @@ class Turned:
     mirrored: tuple[int, ...] = ()
     left_out: tuple[int, ...] = ()
     reasons: tuple[str, ...] = ()
+    mouths: tuple[tuple[int, ...], ...] = ()
 
 
 def fit_turned(

@@ -21,7 +21,7 @@ from stages.dentition.working import resized_dentition, working_scale, working_v
 from stages.init.dental.mirror_images import Turned, fit_turned
 from stages.init.dental.numbering.arch import fit_arch
 from stages.init.dental.numbering.arch_options import ArchOptions
-from stages.init.dental.odd_ones import without_odd_ones
+from stages.init.dental.odd_ones import SeveralMouthsError, without_odd_ones
 from stages.init.dental.solution import ArchFit, PlacedView
 from stages.init.dental.surface.beyond import without_guesses_beyond
 from stages.init.dental.surface.dense import ArchSurface, dense_surface
@@ -193,21 +193,39 @@ def place_teeth(
     ]
     placed = sum(view is not None for view in fit.views)
     if placed < 2 or (fit.doubts and not accept_doubtful):
-        shown = [as_sentence(doubt, names) for doubt in fit.doubts]
-        enough = " The front and one side are enough if the third does not belong." * (found == 3)
-        raise ReconstructionError(
-            f"The teeth were found, but the result would not be safe to look at. {' '.join(shown)} "
-            "Check the numbers in the labelled photographs; a wrong one can be put right, and a "
-            f"photograph left out, on the page check.html.{enough} {HOW_TO_SHOOT_TEETH} If you "
-            "know better, go on all the same: --set init.dental.accept_doubtful=true.",
-            evidence(overlays(views, numbered)),
-            {"teeth": Teeth(tuple(d for d in numbered if d is not None))},
-        )
+        pictures = evidence(overlays(views, numbered))
+        read_so_far = {"teeth": Teeth(tuple(d for d in numbered if d is not None))}
+        if turned.mouths:
+            raise SeveralMouthsError(several_mouths(turned.mouths, names), pictures, read_so_far)
+        raise ReconstructionError(doubtful(fit, names, found), pictures, read_so_far)
     full = [
         FullSize(view.image, view.valid(), d.mask, d.above) if d else None
         for view, d in zip(views, numbered, strict=True)
     ]
     return PlacedTeeth(views, numbered, fit, turned, full)
+
+
+def doubtful(fit: ArchFit, names: Sequence[str], found: int) -> str:
+    """Why a fit of so many photographs is not gone on with, and what to do."""
+    shown = " ".join(as_sentence(doubt, names) for doubt in fit.doubts)
+    enough = " The front and one side are enough if the third does not belong." * (found == 3)
+    return (
+        f"The teeth were found, but the result would not be safe to look at. {shown} Check the "
+        "numbers in the labelled photographs; a wrong one can be put right, and a photograph left "
+        f"out, on the page check.html.{enough} {HOW_TO_SHOOT_TEETH} If you know better, go on all "
+        "the same: --set init.dental.accept_doubtful=true."
+    )
+
+
+def several_mouths(mouths: Sequence[Sequence[int]], names: Sequence[str]) -> str:
+    """What to say of photographs that are of two mouths, of which one at least was made out."""
+    one, *other = (", ".join(names[k] for k in mouth) for mouth in mouths)
+    others = f"so do {other[0]}, but not the ones the others" if other else "no other one fits them"
+    return (
+        f"These photographs are of two patients, or of two visits: {one} fit each other, and "
+        f"{others}. Give each mouth a folder of its own, or leave out those that do not belong on "
+        "the page check.html."
+    )
 
 
 def seen_from_elsewhere(fit: ArchFit, names: Sequence[str], said: Mapping[int, Kind]) -> list[str]:
