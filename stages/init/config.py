@@ -153,6 +153,7 @@ class DentalConfig(StageConfig):
 
     order: tuple[Literal["right", "frontal", "left", "between"], ...] | None = Field(
         None,
+        min_length=1,
         description="what each photograph shows, in the order of the file names: right or left "
         "buccal, frontal, between; null: found out",
     )

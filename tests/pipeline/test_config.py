@@ -101,6 +101,11 @@ def test_a_misspelled_choice_names_the_nearest(given: str, told: str) -> None:
         load_config("dentalsplat", [given])
 
 
+def test_an_order_of_no_photographs_is_refused_before_anything_runs() -> None:
+    with pytest.raises(RequestError, match=r"init\.dental\.order=\[\] is not allowed"):
+        load_config("dentalsplat", ["init.dental.order=[]"])
+
+
 def test_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(RequestError, match="Did you mean 'dentalsplat'"):
         load_config("dentalsplot")
