@@ -19,7 +19,7 @@ from pipeline.store.cleaning import checkpoints
 from pipeline.store.places import is_folder, set_aside
 from pipeline.store.records import DamagedError, SavedRequest, read_record, write_sealed
 from pipeline.untrusted.names import printable
-from pipeline.untrusted.own import REQUEST
+from pipeline.untrusted.own import BATCH, REQUEST
 from pipeline.untrusted.paths import given_path, home_told
 
 #: Folders that say nothing about the case inside them; their parent's name does.
@@ -102,6 +102,16 @@ def is_workspace(folder: Path) -> bool:
     return True
 
 
+def _what_instead(folder: Path) -> str:
+    """What a folder is that is no workspace, and which one to give."""
+    if (folder / BATCH).is_file():
+        return (
+            "it is the folder of a batch. Each of its cases is a workspace: give one, "
+            f"-w {quote(str(folder / 'cases'))}/NAME. {folder / 'summary.html'} tells of all."
+        )
+    return "no run has been started there. Give the folder that 'pipeline run' named, with -w."
+
+
 def read_request(folder: Path) -> dict[str, Any]:
     """What a workspace was asked for last: images, preset, overrides, stages, from.
 
@@ -127,10 +137,7 @@ def read_request(folder: Path) -> dict[str, Any]:
             f"results (--retry), or by itself: pipeline run PHOTOGRAPHS -w {quote(str(folder))}"
         )
     if found is None:
-        raise RequestError(
-            f"{folder} is not a workspace: no run has been started there. Give the folder that "
-            "'pipeline run' named, with -w."
-        )
+        raise RequestError(f"{folder} is not a workspace: {_what_instead(folder)}")
     return found.model_dump(by_alias=True)
 
 
@@ -362,7 +369,9 @@ def clean(
     if not isinstance(keep, int) or keep < 0:
         raise RequestError(f"keep is a number of results, 0 or more; this is {shown(keep)}.")
     if not is_workspace(folder):
-        raise RequestError(f"{folder} is not a workspace, so nothing in it was deleted.")
+        raise RequestError(
+            f"{folder} is not a workspace, so nothing in it was deleted: {_what_instead(folder)}"
+        )
     store = Store(folder)
     return store.clean(keep, () if everything else _useful(folder, checkpoints(folder)))
 

@@ -14,6 +14,7 @@ from pipeline.front.progress import LineReporter
 from pipeline.planning import key_material
 from pipeline.running.reporter import Reporter
 from pipeline.stage import get_stage
+from pipeline.studies.report import run_report
 
 
 def states(toys: Path, *overrides: str) -> dict[str, tuple[str, list[str]]]:
@@ -118,6 +119,13 @@ def test_what_a_workspace_remembers_may_be_of_no_use_any_more(run: Any, toys: Pa
     (toys / "toy.yaml").write_text(f"stages: {toy.ORDER}\nthreads: 1\n")
     with pytest.raises(pipeline.RequestError, match=r"^'scale\.nope' is not a setting"):
         pipeline.run(workspace=toys / "w", overrides=["scale.nope=3"])
+
+
+@pytest.mark.parametrize("call", [pipeline.status, pipeline.clean, run_report])
+def test_of_the_folder_of_a_batch_its_cases_are_named(call: Any, tmp_path: Path) -> None:
+    (tmp_path / "batch.json").write_text("{}")
+    with pytest.raises(pipeline.RequestError, match=r"of a batch.* -w .*cases/NAME"):
+        call(workspace=tmp_path)
 
 
 def test_unknown_workspace_is_refused(toys: Path) -> None:
