@@ -31,6 +31,8 @@ _STARTS = (
 _TEXTS = ((b"ffconcat", "a script of film names"), (b"#EXTM3U", "a playlist"))
 #: Bytes of the start of a film that `reader_for` looks at.
 HEAD = 1024
+#: The name of ASF's object with the size of the whole file.
+_PROPERTIES = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
 
 
 def reader_for(head: bytes) -> str:
@@ -92,10 +94,11 @@ def opened_film(file: BinaryIO) -> InputContainer:
 
 
 def promised_size(file: BinaryIO) -> int:
-    """Bytes that a film has by what its outermost boxes say, 0 where its format does not tell.
+    """Bytes that a film has by what its head or outermost boxes say, 0 where these do not tell.
 
     A film with fewer has lost its end, as a copy that was broken off: decoders end there without a
-    word. Told of AVI, Matroska and WebM; of MP4 and MOV the index says more, the number of frames.
+    word. Told of AVI, Matroska, WebM and WMV; of MP4 and MOV the index says more, the number of
+    frames; MPEG has nothing that tells.
 
     Args:
         file: at any place.
@@ -105,7 +108,25 @@ def promised_size(file: BinaryIO) -> int:
     file.seek(0)
     if sort == "avi":
         return _end_of_riff(file)
+    if sort == "asf":
+        return _size_in_properties(file)
     return _end_of_segment(file) if sort == "matroska" else 0
+
+
+def _size_in_properties(file: BinaryIO) -> int:
+    """The size in the properties of an ASF (WMV); 0 where it has none, or is a broadcast."""
+    place = 30  # behind what the header itself says: its name, size, and number of objects
+    for _ in range(100):
+        file.seek(place)
+        found = file.read(92)
+        size = int.from_bytes(found[16:24], "little")
+        if len(found) < 92 or not 24 <= size <= 1 << 32:
+            return 0
+        if found[:16] == _PROPERTIES:
+            is_broadcast = found[88] & 1
+            return 0 if is_broadcast else int.from_bytes(found[40:48], "little")
+        place += size
+    return 0
 
 
 def _end_of_riff(file: BinaryIO) -> int:

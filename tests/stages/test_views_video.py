@@ -336,7 +336,7 @@ def test_a_film_whose_index_comes_first_may_break_off(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("ending", ["avi", "mkv", "webm"])
+@pytest.mark.parametrize("ending", ["avi", "mkv", "webm", "wmv"])
 def test_a_film_without_a_count_of_its_frames_that_breaks_off_is_said_to(
     tmp_path: Path, ending: str
 ) -> None:
