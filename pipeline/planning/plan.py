@@ -71,7 +71,8 @@ def plan_stage(
         if not stage.uses_sources:
             _sources(stage, config, request)  # what is wrong there is said before the others run
         state = "pending" if pointer else "missing"
-        return PlannedStage(name, state, inputs, [f"depends on {' and '.join(waiting)}"])
+        reasons = [f"depends on {' and '.join(waiting)}"]
+        return PlannedStage(name, state, inputs, reasons, notes=notes)
     if stage.uses_sources and not images:
         raise RequestError(
             f"No photographs are named, and {store.root} remembers none: no run was started there. "

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from pipeline.artifacts.cameras import Cameras
@@ -53,6 +54,7 @@ class InitStage(Stage):
     def sources(self, config: Any, request: Mapping[str, Any]) -> Mapping[str, Path]:
         from pipeline.artifacts.dental.corrections import (
             CORRECTIONS,
+            corrections_beside,
             corrections_file,
             read_corrections,
         )
@@ -62,6 +64,11 @@ class InitStage(Stage):
         if said:
             read_corrections(said)  # a wrong file is said before any work is done
             files[CORRECTIONS] = said
+        elif beside := corrections_beside(request):
+            request["tell"](
+                f"{beside} is not used: it lies beside the photographs. Put it into the workspace, "
+                f"or name it: --set {quote(f'init.dental.labels={beside}')}"
+            )
         return files
 
     def backend(self, config: Any) -> str:

@@ -363,3 +363,19 @@ def test_known_length_gives_millimetres(tmp_path):
     assert abs(ours / truth - 1) < 0.02
     with pytest.raises(RequestError, match=r"no photograph 'frontel'.*frontal"):
         run(tmp_path / "wrong", folder, length={**length, "photo": "frontel"})
+
+
+def test_what_was_put_right_beside_the_photographs_is_said_not_to_be_used(tmp_path):
+    photographs, workspace = tmp_path / "photographs", tmp_path / "w"
+    photographs.mkdir()
+    workspace.mkdir()
+    (photographs / "teeth.yaml").write_text("photographs: {}")
+    for images in ([photographs], [photographs / "left.jpg"]):
+        told = []
+        request = {"images": images, "workspace": workspace, "tell": told.append}
+        assert InitStage().sources(InitConfig(), request) == {}
+        assert len(told) == 1 and f"{photographs / 'teeth.yaml'} is not used" in told[0]
+    (workspace / "teeth.yaml").write_text("photographs: {}")
+    told.clear()
+    assert "teeth.yaml" in InitStage().sources(InitConfig(), request)
+    assert not told

@@ -123,6 +123,22 @@ def corrections_file(
     return found if found and (found.exists() or found.is_symlink()) else None
 
 
+def corrections_beside(request: Mapping[str, Any]) -> Path | None:
+    """The `teeth.yaml` that lies beside the photographs of a request, where none is used.
+
+    Args:
+        request: what the user asked for (`images`: photographs, or folders of them; `tell`: takes
+            what there is to say; without it, None).
+    """
+    if "tell" not in request:
+        return None
+    for path in map(Path, request.get("images", ())):
+        found = (path if path.is_dir() else path.parent) / CORRECTIONS
+        if found.is_file():
+            return found
+    return None
+
+
 def read_corrections(path: Path) -> Corrections:
     """Read a file of corrections.
 
