@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,9 +12,13 @@ import pytest
 from pipeline.artifacts.teeth import Crown, Dentition
 from pipeline.artifacts.views import View
 from pipeline.errors import ReconstructionError
+from pipeline.geometry.rigid import exponential
 from stages.init.dental import reconstruct
+from stages.init.dental.cameras.bundle import Adjusted
+from stages.init.dental.cameras.unrolled import PairFigures
 from stages.init.dental.mirror_images import Turned
 from stages.init.dental.numbering.arch_options import ArchOptions
+from stages.init.dental.numbering.confidence import unlike_neighbours
 from stages.init.dental.odd_ones import MOST_TRIED, without_odd_ones
 from stages.init.dental.solution import ArchFit, PlacedView
 
@@ -110,6 +116,15 @@ def test_two_of_another_mouth_go_whichever_of_the_others_fits_worst() -> None:
     assert {len(there) for there in asked} == {3, 4}
 
 
+def test_of_two_sets_that_are_as_sure_nobody_can_tell_which_is_right() -> None:
+    either = lambda there: {2, 3} <= there  # noqa: E731
+    assert left_out(4, either, kinds="rfll")[0] == ()
+    surer = {frozenset({0, 1, 2}): 0.36}
+    assert left_out(4, either, sure=surer, kinds="rfll")[0] == (3,)
+    # one that a person wants decides
+    assert left_out(4, either, sure=surer, kinds="rfll", kept=(3,))[0] == (2,)
+
+
 def test_half_of_them_are_no_reason_to_leave_out_the_others() -> None:
     doubts = lambda there: there != {0, 1, 2}  # noqa: E731
     assert outcome(6, doubts, kinds="rflrfl")[0].mouths == ((0, 1, 2),)
@@ -133,8 +148,26 @@ def test_two_mouths_are_told_and_neither_is_left_out() -> None:
     assert outcome(6, doubts, kinds="rflrfl")[0].mouths == ((0, 1, 2), (3, 4, 5))
     # where a mixture agrees as well, at most one is made out
     mouths.add(frozenset({0, 1, 5}))
-    sure = {frozenset({0, 1, 5}): 0.2}
-    assert outcome(6, doubts, sure=sure, kinds="rflrfl")[0].mouths in {((0, 1, 2),), ((3, 4, 5),)}
+    sure = {frozenset({0, 1, 2}): 0.9}
+    assert outcome(6, doubts, sure=sure, kinds="rflrfl")[0].mouths == ((0, 1, 2),)
+
+
+def test_what_is_seen_from_one_side_has_to_match() -> None:
+    yaws = np.radians([-40.0, -33.0, 0.0, 4.0, 9.0, 40.0])
+    turned = [exponential(np.array([0, 0, 0, 0, yaw, 0]))[0] for yaw in yaws]
+    adjusted = cast(Adjusted, SimpleNamespace(rotations=np.array(turned)))
+
+    def doubts(*shares: float) -> list[str]:
+        pairs = {(k, k + 1): PairFigures(9, share, 0.01) for k, share in enumerate(shares)}
+        return unlike_neighbours([f"{k}.jpg" for k in range(6)], adjusted, pairs, ArchOptions())
+
+    # what is seen from far apart never matches as much, and one neighbour that matches is enough
+    assert doubts(0.2, 0.01, 0.2, 0.2, 0.01) == []
+    (told,) = doubts(0.03, 0.01, 0.2, 0.2, 0.01)
+    assert told.startswith("0.jpg and 1.jpg show the teeth from nearly the same side")
+    assert "(3 %)" in told
+    (told,) = doubts(0.2, 0.01, 0.2, 0.04, 0.01)
+    assert told.startswith("3.jpg and 4.jpg")
 
 
 @pytest.mark.parametrize(

@@ -347,7 +347,9 @@ def arch_options(
             )
         said = {view.name: role for view, role in zip(every, order, strict=True)}
         order = tuple(said[view.name] for view in views.views)
-    return ArchOptions(order=order, one_sitting=one_sitting(taking_part(views, dentitions)))
+    return ArchOptions(
+        order=order, one_sitting=one_sitting(taking_part(views, dentitions)), one_film=views.ordered
+    )
 
 
 def surface_options(config: DentalConfig) -> SurfaceOptions:

@@ -121,6 +121,15 @@ class ArchOptions:
     #: Median distance of dense matches from their epipolar lines above which a pair is doubted, as
     #: a share of the band.
     max_epipolar_error: float = 0.036
+    #: Photographs less than `nearby` degrees apart are doubted if dense matches cover less than
+    #: this share of what both show. Of 16 generated mouths that pass otherwise, each photographed
+    #: twice from one side, blurred, small or in another light as well, it is .08 to .36, below .1
+    #: in one; of 31 pairs of two mouths .02 to .09. Of a real one .30, of five pairs of two
+    #: patients .01 to .02.
+    nearby: float = 15.0
+    min_nearby_share: float = 0.1
+    #: All are frames of one film, some of which may be too blurred to match.
+    one_film: bool = False
 
     def cost_of_missing(self, absent: frozenset[int]) -> float:
         """What it costs to call these teeth (FDI numbers) missing in the patient."""

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts.teeth import Dentition
+from pipeline.geometry.rigid import angle_between
 from stages.dentition.tooth_rows import NO_TOOTH
 from stages.init.dental.cameras.bundle import Adjusted, Sightings
 from stages.init.dental.cameras.kernels import PER_VIEW
@@ -211,7 +212,33 @@ def fit_doubts(
                 f"what matches between {a} and {b} contradicts their cameras (off by "
                 f"{100 * pair.epipolar_error:.1f} % of the height of the row, median)"
             )
+    if not known and not options.one_film:
+        doubts += unlike_neighbours(photos, adjusted, evidence.pairs, options)
     return doubts, figures
+
+
+def unlike_neighbours(
+    photos: Sequence[str], adjusted: Adjusted, pairs: Mapping[tuple[int, int], PairFigures],
+    options: ArchOptions,
+) -> list[str]:  # fmt: skip
+    """Doubts about photographs from nearly the same side as others, none of which they match."""
+    nearby = {
+        pair: figures.share
+        for pair, figures in pairs.items()
+        if angle_between(*(adjusted.rotations[view] for view in pair)) < options.nearby
+    }
+    best = {
+        view: max(share for pair, share in nearby.items() if view in pair)
+        for pair in nearby
+        for view in pair
+    }
+    return [
+        f"{photos[i]} and {photos[j]} show the teeth from nearly the same side, but hardly "
+        f"anything in one is found in the other ({100 * share:.0f} %): they are of two patients or "
+        "of two visits, or one is not sharp"
+        for (i, j), share in sorted(nearby.items())
+        if min(best[i], best[j]) < options.min_nearby_share
+    ]
 
 
 def _stranger(photo: str, places_fit: bool) -> str:
