@@ -179,7 +179,9 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
             "accepted_wrong": sum(row["accepted"] and is_wrong(row) for row in mixes),
         }
         if sort == BOTH:
-            result[sort]["told"] = sum("of two patients" in row["why_not"] for row in mixes)
+            result[sort]["told"] = sum(
+                "fit each other, and so do" in row["why_not"] for row in mixes
+            )
         if sort == SWAPPED:
             same = sum(row["accepted"] == accepted.get(row["patients"][0]) for row in mixes)
             result[sort]["as_unswapped"] = same

@@ -23,7 +23,7 @@ Set = frozenset[int]
 
 
 class SeveralMouthsError(ReconstructionError):
-    """Photographs are of two patients, or of two visits of one."""
+    """Photographs are of two patients, or of two visits of one, or half of them may be."""
 
 
 def without_odd_ones(turned: Turned, fit: Fit, kept: Collection[int]) -> Turned:

@@ -220,11 +220,19 @@ def doubtful(fit: ArchFit, names: Sequence[str], found: int) -> str:
 def several_mouths(mouths: Sequence[Sequence[int]], names: Sequence[str]) -> str:
     """What to say of photographs that are of two mouths, of which one at least was made out."""
     one, *other = (", ".join(names[k] for k in mouth) for mouth in mouths)
-    others = f"so do {other[0]}, but not the ones the others" if other else "no other one fits them"
+    if other:
+        told = (
+            f"These photographs are of two patients, or of two visits: {one} fit each other, and "
+            f"so do {other[0]}, but not the ones the others."
+        )
+    else:
+        told = (
+            f"Of these photographs half fit each other, {one}, and none of the others fits them: "
+            "these may be of another patient or visit."
+        )
     return (
-        f"These photographs are of two patients, or of two visits: {one} fit each other, and "
-        f"{others}. Give each mouth a folder of its own, or leave out those that do not belong on "
-        "the page check.html."
+        f"{told} Give each mouth a folder of its own, or leave out those that do not belong on the "
+        "page check.html."
     )
 
 
