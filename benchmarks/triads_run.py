@@ -54,6 +54,7 @@ class Outcome:
         teeth: with the numbers of all photographs together, as far as it came.
         placed: names of the views that are in the scene.
         fit: what `init` rests on, accepted or not; None: it never came to one.
+        first_fit: of all photographs, before any was turned over or left out.
         fitted: names of the views in the order of the fit.
         pictures: of `init`.
         seconds: stage -> wall seconds; reading counts as it took when it was done.
@@ -68,6 +69,7 @@ class Outcome:
     teeth: Teeth | None = None
     placed: tuple[str, ...] = ()
     fit: ArchFit | None = None
+    first_fit: ArchFit | None = None
     fitted: tuple[str, ...] = ()
     pictures: dict[str, Picture] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -185,6 +187,7 @@ class Runner:
             )  # fmt: skip
         return replace(
             outcome, fit=self._placed or (self._fits[0] if self._fits else None),
+            first_fit=self._fits[0] if self._fits else None,
             fitted=tuple(view.name for view in views.views),
             seconds={**outcome.seconds, "init": time.perf_counter() - started},
         )  # fmt: skip
