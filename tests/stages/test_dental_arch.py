@@ -202,7 +202,10 @@ def test_two_photographs_one_of_them_from_the_front(shown: tuple[int, int]) -> N
 def test_two_photographs_of_the_sides_alone_are_doubted() -> None:
     dentitions, _, _ = three()
     result = fit([dentitions[0], dentitions[2]], QUICK)
-    assert any("look like right and left views" in doubt for doubt in result.doubts)
+    assert any(
+        "right and left views, which share too few teeth: add one from the front" in doubt
+        for doubt in result.doubts
+    )
 
 
 @pytest.mark.parametrize("height", [1.0, 1.25])

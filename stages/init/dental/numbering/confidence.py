@@ -340,9 +340,11 @@ def role_doubts(best: Scored) -> list[str]:
     side: both sides share so few teeth that the angle between them may be off by any amount."""
     roles = best.labelling.roles
     if len(roles) == 2 and ("frontal" not in roles or len(set(roles)) == 1):
+        lacking = "one from each side" if "frontal" in roles else "one from the front"
+        why = "share too few teeth" if len(set(roles)) == 2 else "show the teeth from one side"
         return [
-            f"the two photographs look like {' and '.join(map(plain_role, roles))} views, and one "
-            "must be from the front, the other from a side"
+            f"the two photographs look like {' and '.join(map(plain_role, roles))} views, which "
+            f"{why}: add {lacking}"
         ]
     if len(roles) == 2:
         return []
