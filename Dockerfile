@@ -18,10 +18,11 @@ COPY dentalsplat dentalsplat
 COPY pipeline pipeline
 COPY stages stages
 COPY configs configs
-# Bytecode is made here: later nobody may write beside the program. Open3D without CUDA is a third.
-RUN pip install --no-cache-dir --compile --constraint constraints.txt '.[batch,dicom]' \
-    && pip uninstall --yes open3d \
-    && pip install --no-cache-dir --compile --constraint constraints.txt open3d-cpu \
+COPY tools/requirements.py tools/
+# Bytecode is made here: later nobody may write beside the program.
+RUN python tools/requirements.py batch dicom > requirements.txt \
+    && pip install --no-cache-dir --compile --constraint constraints.txt --requirement requirements.txt \
+    && pip install --no-cache-dir --compile --constraint constraints.txt --no-deps . \
     && rm -rf /src
 
 # The kernels, compiled beside the program, where every user may read them. They are for the kind of

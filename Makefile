@@ -100,21 +100,24 @@ chromium: | system
 .venv/bin/python: | system
 	$(PYTHON) -m venv --upgrade-deps .venv
 
+# Open3D comes without CUDA (tools/requirements.py), which pip, asked for the package, would not do.
 # Compiled by all cores at once: pip does it with one. Some packages hold files for other Pythons;
 # of the large ones left out here little is ever imported. setuptools warns of every editable install.
 RARELY := tests|pip|torch|torchgen|sympy|mpmath|plotly|mypy|mypyc|fontTools|pygments|IPython|jedi
 define install
-PYTHONWARNINGS=ignore:Editable $(BIN)/python -m pip install --quiet --no-compile \
-    --constraint constraints.txt --editable '$(1)'
+$(BIN)/python tools/requirements.py $(1) > .venv/requirements.txt
+$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt \
+    --requirement .venv/requirements.txt
+PYTHONWARNINGS=ignore:Editable $(BIN)/python -m pip install --quiet --no-compile --no-deps --editable .
 $(BIN)/python -m compileall -q -j 0 -x '/($(RARELY))/' .venv/lib > /dev/null || true
 endef
 
-.venv/installed: .venv/bin/python setup.cfg constraints.txt
-	$(call install,.)
+.venv/installed: .venv/bin/python setup.cfg constraints.txt tools/requirements.py
+	$(call install)
 	touch $@
 
-.venv/installed-dev: .venv/bin/python setup.cfg constraints.txt
-	$(call install,.[dev])
+.venv/installed-dev: .venv/bin/python setup.cfg constraints.txt tools/requirements.py
+	$(call install,dev)
 	touch .venv/installed $@
 
 # Not what else is in runs: people's cases are there.

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
@@ -176,6 +177,27 @@ def test_lpips_is_left_out_without_torch(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert perceptual.find_vgg_weights(None) is None
     with pytest.raises(RequestError, match=r"evaluate.lpips_weights needs torch"):
         perceptual.find_vgg_weights(str(cached))
+
+
+def test_open3d_comes_without_cuda_where_there_is_such_a_wheel(
+    setup_cfg: configparser.ConfigParser,
+) -> None:
+    spec = spec_from_file_location("requirements", ROOT / "tools" / "requirements.py")
+    assert spec is not None and spec.loader is not None
+    tool = module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    asked = setup_cfg["options"]["install_requires"].split()
+    assert list(tool.requirements([], "Darwin", "arm64")) == asked
+    without = list(tool.requirements(["torch", "dicom"], "Linux", "x86_64"))
+    assert {line.replace("open3d-cpu", "open3d") for line in without} > set(asked)
+    assert not any(line.startswith("open3d>") for line in without)
+    assert any(line.startswith("torch>") for line in without)
+    assert any(line.startswith("pydicom>") for line in without)
+    pinned = dict(
+        line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    )  # fmt: skip
+    assert pinned["open3d-cpu"] == pinned["open3d"]
 
 
 def test_the_wheel_of_another_name_will_do(monkeypatch: pytest.MonkeyPatch) -> None:
