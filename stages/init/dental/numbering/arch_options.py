@@ -125,7 +125,10 @@ class ArchOptions:
     #: this share of what both show. Of 16 generated mouths that pass otherwise, each photographed
     #: twice from one side, blurred, small or in another light as well, it is .08 to .36, below .1
     #: in one; of 31 pairs of two mouths .02 to .09. Of a real one .30, of five pairs of two
-    #: patients .01 to .02.
+    #: patients .01 to .02. With cameras and crops at random (`benchmarks/nearby.py`, 30 mouths) .13
+    #: and more, and up to 20 degrees .09; of two mouths .04 at most. Further apart real ones
+    #: match as little as strangers do: .24 at 13 degrees, .13 at 21, .05 at 29 in the scan video,
+    #: .04 to .12 at 22 and .01 to .05 at 30 to 37 between fronts and sides of twelve patients.
     nearby: float = 15.0
     min_nearby_share: float = 0.1
     #: All are frames of one film, some of which may be too blurred to match.
