@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from pathlib import PurePath
 from typing import Any
 
 from pipeline.untrusted.names import readable
@@ -85,15 +86,19 @@ def shown(value: object, letters: int = 100) -> str:
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"`` for the allowed name closest to `name`, or nothing.
 
-    Capitals make no difference, but where names differ in these alone.
+    Capitals make no difference, but where names differ in these alone; nor does it count that both
+    are names of files of one kind.
     """
     if len(name) > LONGEST_GUESSED:
         return ""
     names = list(allowed)
-    close = difflib.get_close_matches(
-        name.casefold(), [each.casefold() for each in names], n=1, cutoff=0.5
-    )
-    fitting = [each for each in names if each.casefold() in close]
+    suffix = PurePath(name.casefold()).suffix
+
+    def plain(each: str) -> str:
+        return each.casefold().removesuffix(suffix)
+
+    close = difflib.get_close_matches(plain(name), map(plain, names), n=1, cutoff=0.5)
+    fitting = [each for each in names if plain(each) in close]
     best = difflib.get_close_matches(name, fitting, n=1, cutoff=0.0)
     return f" Did you mean '{best[0]}'?" if best else ""
 

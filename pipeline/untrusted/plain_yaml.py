@@ -84,6 +84,9 @@ def plain_yaml(text: str, where: str, aliases: bool = False) -> Any:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it holds characters that YAML doesn't allow"
+        lines = text.splitlines()[mark.line :] if mark else []
+        if lines and re.match(r" *\t", lines[0]):
+            problem = "it is indented by a tab, where YAML has spaces"
         raise RequestError(f"{where}{line} is not YAML: {problem}.") from error
 
 

@@ -120,6 +120,7 @@ def one(entry: str) -> str:
         ("--- 1\n--- 2", "several documents"),
         ("photographs: {", "is not YAML"),
         ("a: \x00", "is not YAML"),
+        ("photographs:\n  a.jpg:\n\t\tuse: false", "line 3 is not YAML: it is indented by a tab"),
         ("[" * 100_000, "nested deeper"),
         ("- 1\n" * 100_000, "more entries"),
         ("#" * 2**20 + "\n", "more than a text of settings may have"),

@@ -239,6 +239,9 @@ def test_what_is_said_later_is_of_the_photograph_as_it_was_taken() -> None:
 def test_unknown_and_doubled_photographs_are_refused() -> None:
     with pytest.raises(RequestError, match=r"no photograph 'O_right.jpg'.*Did you mean '0_right"):
         applied(O_right_jpg=PhotoCorrection(use=True))
+    # that both end in .jpg makes no name like another
+    with pytest.raises(RequestError, match=r"no photograph 'IMG_1.jpg'\. The photographs are"):
+        applied(IMG_1_jpg=PhotoCorrection(use=True))
     with pytest.raises(RequestError, match=r"'000' and '0_right.jpg' are the same photograph"):
         applied(v000=PhotoCorrection(use=True), v0_right_jpg=PhotoCorrection(use=False))
 
