@@ -149,3 +149,29 @@ def test_a_split_of_what_was_read_as_two_is_of_both(tmp_path: Path) -> None:
     run_report(workspace)
     shown = data_of((workspace / "check.html").read_text())["photographs"][1]
     assert [crown["number"] for crown in shown["earlier"]["crowns"][0]["was"]] == [12, 12]
+
+
+JOINED = """
+  const file = () => check.yaml().split("\\n").filter((line) => line.includes("tooth:"))
+    .map((line) => line.match(/tooth: (\\d+)/)[1]).join(" ");
+  result.start = [row(0).join(" "), file()];
+  chip(0, "28").click();
+  press("2"); press("7");
+  result.anew = [row(0).join(" "), file()];
+  press("t");
+  result.back = [row(0).join(" "), file()];
+"""
+
+
+@needs_chromium
+def test_the_number_of_joined_parts_is_of_all_of_them(tmp_path: Path) -> None:
+    x, y = case.original(5, "upper")
+    parts = [CrownCorrection((x + side, y), tooth=28) for side in (-20, 20)]
+    crowns = (CrownCorrection((x, y), split=_across(5)), *parts)
+    told = {"0_right.jpg": PhotoCorrection(crowns=crowns)}
+    workspace = corrected_case(tmp_path / "case", case.teeth(), told)
+    result = probed(workspace, tmp_path / "browser", JOINED)
+    row = "13 12 11 21 22 {} 43 42 41 31 32 33"
+    assert result["start"] == [row.format(28), "28 28"]
+    assert result["anew"] == [row.format(27), "27 27"]
+    assert result["back"] == [row.format("?"), ""]

@@ -60,13 +60,12 @@ const undo = () => {
   draw();
 };
 const put = (photo, crown, number) => {
-  // An earlier number of the same crown is replaced; a split before it stays, and what was before.
-  const split = photo.entries.indexOf(splitSaid(photo, crown));
-  const earlier = photo.entries.filter((entry, k) => k > split && entry.tooth
-    && contains(crown.outline, shownAt(photo, entry.at)));
+  // What was said of it before is said anew, of each of its parts where those were joined.
+  const earlier = numbersWithin(photo, crown);
   const was = numberSaid(photo, crown)?.was ?? [crown];
-  photo.entries = [...photo.entries.filter((entry) => !earlier.includes(entry)),
-    { at: original(photo, innerPoint(crown.outline)), tooth: number, was }];
+  photo.entries = earlier.length
+    ? photo.entries.map((entry) => (earlier.includes(entry) ? { ...entry, tooth: number } : entry))
+    : [...photo.entries, { at: original(photo, innerPoint(crown.outline)), tooth: number, was }];
   photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
     : { ...other, number, doubt: 0, said: true, jaw: jawOf(number) }));
 };
@@ -131,8 +130,9 @@ const bringBack = (photo, { at, ...crown }) => {
 const takeBackNumber = (photo, crown) => {
   const entry = numberSaid(photo, crown);
   const { number = 0, doubt = 1, jaw = crown.jaw, said = false } = entry.was[0] ?? {};
+  const parts = numbersWithin(photo, crown).filter((other) => other.tooth === crown.number);
   change(() => {
-    photo.entries = photo.entries.filter((other) => other !== entry);
+    photo.entries = photo.entries.filter((other) => other !== entry && !parts.includes(other));
     photo.crowns = photo.crowns.map((other) => (other.id !== crown.id ? other
       : { ...other, number, doubt, jaw, said }));
   });

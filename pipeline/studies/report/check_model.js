@@ -176,6 +176,10 @@ const numberSaid = (photo, crown) => photo.entries.findLast((entry) => entry.too
   && entry.tooth === crown.number && isNear(crown, shownAt(photo, entry.at)));
 const splitSaid = (photo, crown) => photo.entries.findLast((entry) => entry.split
   && entry.was.some(({ outline }) => contains(outline, innerPoint(crown.outline))));
+// The numbers said of a crown since it was split: several where parts were joined to it.
+const numbersWithin = (photo, crown) => photo.entries
+  .slice(photo.entries.indexOf(splitSaid(photo, crown)) + 1)
+  .filter((entry) => entry.tooth && contains(crown.outline, shownAt(photo, entry.at)));
 // Numbers and splits of what isn't read any more: they keep a run from going on.
 const lostEntries = (photo) => photo.entries.filter((entry) => (entry.tooth || entry.split)
   && !entry.was.length && !photo.crowns.some((crown) => isNear(crown, shownAt(photo, entry.at))));
