@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby, pairwise
 
 import cv2
 import numpy as np
@@ -15,8 +16,9 @@ from pipeline.artifacts.dental.corrections import (
     CrownCorrection,
     PhotoCorrection,
     Place,
+    composed,
 )
-from pipeline.artifacts.dental.fdi import JAWS, WISDOM, Jaw, is_upper
+from pipeline.artifacts.dental.fdi import JAWS, WISDOM, Jaw, is_left, is_upper
 from pipeline.artifacts.teeth import UNREAD, Crown, Dentition, Teeth
 from pipeline.artifacts.views import View, Views
 from pipeline.errors import RequestError, nearest
@@ -100,27 +102,29 @@ def photographs_of(
         if stem and stems.count(stem) == 1
     }  # fmt: skip
     names |= {view.source_name: view.name for view in views.views if view.source_name}
+    names = {composed(name): view for name, view in names.items()}
     found: dict[str, tuple[str, PhotoCorrection]] = {}
     for label, photo in corrections.photographs.items():
-        if label not in names:
+        name = names.get(composed(label))
+        if name is None:
             sources = [view.source_name or view.name for view in views.views]
             raise RequestError(
                 f"{corrections.file}: there is no photograph '{label}'.{nearest(label, names)} The "
                 f"photographs are {', '.join(sources)}."
             )
-        if names[label] in found:
+        if name in found:
             raise RequestError(
-                f"{corrections.file}: '{found[names[label]][0]}' and '{label}' are the same "
+                f"{corrections.file}: '{found[name][0]}' and '{label}' are the same "
                 "photograph; say it once."
             )
-        if not photo.is_of(views.by_name()[names[label]].source_sha256):
+        if not photo.is_of(views.by_name()[name].source_sha256):
             raise RequestError(
                 f"{corrections.file}, photograph '{label}': what it says is of another picture, "
                 "which had this name. Take it out of the file and run again: check.html then shows "
                 "the picture that is there now. If it is the same one, saved anew, take out its "
                 "line sha256 alone."
             )
-        found[names[label]] = label, photo
+        found[name] = label, photo
     return found
 
 
@@ -132,11 +136,10 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
         )
     mirrored = dentition.mirrored if photo.mirrored is None else photo.mirrored
     dentition, view = _as_taken(dentition, view)
-    crowns = list(dentition.all_crowns)
+    crowns, gone = list(dentition.all_crowns), list[Crown]()
     moved = False
     for k, change in enumerate(photo.crowns):
-        index = _crown_at(crowns, view.working_place(change.at), change.at, f"{where}, crowns[{k}]")
-        moved |= _change(crowns, index, change, view, f"{where}, crowns[{k}]")
+        moved |= _change(crowns, gone, change, view, f"{where}, crowns[{k}]")
     kind = photo.kind or dentition.kind
     set_aside = dentition.set_aside
     if photo.use is not None:
@@ -161,6 +164,7 @@ def _corrected(dentition: Dentition, view: View, photo: PhotoCorrection, where: 
     )  # fmt: skip
     for jaw in JAWS:
         _check_wisdom_teeth(corrected.crowns(jaw), where)
+        _check_order(corrected.crowns(jaw)[:: -1 if mirrored else 1], where)
     if not mirrored:
         return replace(corrected, mirrored=mirrored)
     turned = mirrored_dentition(corrected)
@@ -182,6 +186,25 @@ def _check_wisdom_teeth(row: tuple[Crown, ...], where: str) -> None:
                 "there are crowns on both sides of this one. Give it another number, or remove "
                 "what is no tooth beyond it."
             )
+
+
+def _check_order(row: tuple[Crown, ...], where: str) -> None:
+    """Refuse what can't be said of a row, as photographs have it: one tooth at two places, and a
+    row that runs backwards."""
+    said = [crown.number if number_is_said(crown) else 0 for crown in row]
+    runs = [number for number, _ in groupby(said) if number]
+    if twice := next((number for number in runs if runs.count(number) > 1), 0):
+        raise RequestError(
+            f"{where}: {twice} is said of crowns that are not side by side. Only neighbours can be "
+            "parts of one tooth: give one of them another number, or remove what lies between them."
+        )
+    stands = [number % 10 if is_left(number) else -(number % 10) for number in runs]
+    if len(stands) > 2 and all(after < before for before, after in pairwise(stands)):
+        raise RequestError(
+            f"{where}: the numbers said run backwards ({', '.join(map(str, runs))} from left to "
+            "right). Say whether it is a mirror image (mirrored: true) or none (mirrored: false); "
+            "if that is right, left and right are mixed up in the numbers."
+        )
 
 
 def _as_taken(dentition: Dentition, view: View) -> tuple[Dentition, View]:
@@ -208,12 +231,11 @@ def crowns_before(
         the other one as well; empty: none is read there.
     """
     dentition, view = _as_taken(dentition, view)
-    crowns, found = list(dentition.all_crowns), list[list[Crown]]()
+    crowns, gone, found = list(dentition.all_crowns), list[Crown](), list[list[Crown]]()
     for change in photo.crowns:
         before = list(crowns)
         with suppress(RequestError):  # the next run says so
-            index = _crown_at(crowns, view.working_place(change.at), change.at, "")
-            _change(crowns, index, change, view, "")
+            _change(crowns, gone, change, view, "")
         changed = [crown for crown in before if not any(crown is now for now in crowns)]
         width = dentition.size[0]
         found.append([mirrored_crown(crown, width) if mirrored else crown for crown in changed])
@@ -221,16 +243,21 @@ def crowns_before(
 
 
 def _change(
-    crowns: list[Crown], index: int, change: CrownCorrection, view: View, where: str
+    crowns: list[Crown], gone: list[Crown], change: CrownCorrection, view: View, where: str
 ) -> bool:
-    """Change one crown in place; says whether landmarks have to be found again."""
+    """Change one crown in place; says whether landmarks have to be found again.
+
+    Args:
+        gone: crowns that were removed before; one more is added here.
+    """
+    index = _crown_at(crowns, gone, view.working_place(change.at), change.at, where)
     crown = crowns[index]
     if change.tooth is not None:
         jaw: Jaw = "upper" if is_upper(change.tooth) else "lower"
         crowns[index] = replace(crown, number=change.tooth, doubt=0.0, jaw=jaw)
         return jaw != crown.jaw
     if change.split is None:
-        del crowns[index]
+        gone.append(crowns.pop(index))
         return True
     start, end = (view.working_place(place) for place in change.split)
     parts = split_polygon(crown.outline, start, end)
@@ -261,15 +288,22 @@ def _across(crowns: list[Crown], index: int, start: Array, end: Array) -> int | 
     return None
 
 
-def _crown_at(crowns: list[Crown], place: Array, said: Place, where: str) -> int:
-    """The crown under a place, or the nearest one within half its width."""
+def _crown_at(crowns: list[Crown], gone: list[Crown], place: Array, said: Place, where: str) -> int:
+    """The crown under a place, or the nearest one within half its width, if none that has gone is
+    meant."""
     point = (float(place[0]), float(place[1]))
     inside = [
         cv2.pointPolygonTest(crown.outline.astype(np.float32)[:, None], point, True)
         if len(crown.outline) >= 3 else -np.inf
-        for crown in crowns
+        for crown in [*crowns, *gone]
     ]  # fmt: skip
-    near = [index for index, distance in enumerate(inside) if -distance <= crowns[index].width / 2]
+    best = max(inside[: len(crowns)], default=-np.inf)
+    if best < 0 and max(inside[len(crowns) :], default=-np.inf) >= 0:
+        raise RequestError(
+            f"{where}: the crown at {_said(said)} was removed by a line before this one. Take one "
+            "of the two out."
+        )
+    near = [k for k, crown in enumerate(crowns) if -inside[k] <= crown.width / 2]
     if not near:
         raise RequestError(
             f"{where}: there is no crown at {_said(said)}. Open check.html to see where they are."

@@ -27,7 +27,7 @@ class InitStage(Stage):
     """Views -> cameras, points, pointmaps."""
 
     name = "init"
-    version = 64
+    version = 65
     summary = "find the cameras and a first dense cloud"
     Config = InitConfig
     requires = ("views",)

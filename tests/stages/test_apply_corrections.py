@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from pipeline.artifacts.dental.corrections import (
 from pipeline.artifacts.teeth import UNREAD, Dentition, Teeth
 from pipeline.artifacts.views import Views
 from pipeline.errors import RequestError
+from pipeline.studies.report.check import content
 from stages.dentition.corrections import (
     LEFT_OUT,
     apply_corrections,
@@ -56,6 +59,33 @@ def test_a_place_beside_a_crown_means_the_nearest() -> None:
     assert applied(v000=PhotoCorrection(crowns=(beside,)))[0].upper[0].number == 14
     with pytest.raises(RequestError, match=r"'000', crowns\[0\]: there is no crown at 4"):
         applied(v000=PhotoCorrection(crowns=(CrownCorrection((4, 4), tooth=14),)))
+
+
+@pytest.mark.parametrize("second", [{"remove": True}, {"tooth": 14}])
+def test_what_is_said_of_a_crown_that_is_removed_is_not_of_its_neighbour(
+    second: dict[str, Any],
+) -> None:
+    place = case.original(2, "upper")
+    crowns = (CrownCorrection(place, remove=True), CrownCorrection(place, **second))
+    with pytest.raises(RequestError, match=r"crowns\[1\]: the crown at .* was removed by a line"):
+        applied(v000=PhotoCorrection(crowns=crowns))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_numbers_that_no_mouth_can_have_are_refused(mirrored: bool) -> None:
+    def said(*teeth: int) -> tuple[Dentition, ...]:
+        row = teeth[::-1] if mirrored else teeth
+        crowns = [
+            CrownCorrection(case.original(k, "upper"), tooth=tooth)
+            for k, tooth in enumerate(row) if tooth
+        ]  # fmt: skip
+        return applied(v000=PhotoCorrection(mirrored=mirrored or None, crowns=tuple(crowns)))
+
+    with pytest.raises(RequestError, match=r"'000': 11 is said of crowns that are not side by"):
+        said(0, 0, 11, 0, 11, 0)
+    with pytest.raises(RequestError, match=r"run backwards \(23, 22, 21, 11, 12, 13 from left"):
+        said(23, 22, 21, 11, 12, 13)
+    assert said(13, 11, 12, 21, 21, 22)
 
 
 def test_what_is_no_tooth_goes_and_landmarks_are_found_again() -> None:
@@ -244,6 +274,16 @@ def test_unknown_and_doubled_photographs_are_refused() -> None:
         applied(IMG_1_jpg=PhotoCorrection(use=True))
     with pytest.raises(RequestError, match=r"'000' and '0_right.jpg' are the same photograph"):
         applied(v000=PhotoCorrection(use=True), v0_right_jpg=PhotoCorrection(use=False))
+
+
+def test_accents_of_a_name_may_be_composed_or_not() -> None:
+    views = case.views(("Zähne rechts.jpg", "Zähne.jpg", "links.jpg"))
+    said = {unicodedata.normalize("NFD", "Zähne.jpg"): PhotoCorrection(use=False)}
+    assert said.keys().isdisjoint(view.source_name for view in views.views)
+    after = apply_corrections(case.teeth(), views, Corrections(said))
+    assert [view.set_aside for view in after.views] == ["", LEFT_OUT, ""]
+    shown = content(after, views, Corrections(said))["photographs"]
+    assert [photo["earlier"]["use"] for photo in shown] == [None, False, None]
 
 
 def test_what_was_said_of_a_photograph_that_was_not_read_is_refused() -> None:

@@ -22,6 +22,7 @@ with the same name nothing here holds.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,6 +99,11 @@ class Corrections:
 
     def __bool__(self) -> bool:
         return any(photo != PhotoCorrection() for photo in self.photographs.values())
+
+
+def composed(name: str) -> str:
+    """A photograph's name with its accents composed: some systems take them apart on copying."""
+    return unicodedata.normalize("NFC", name)
 
 
 def corrections_file(

@@ -15,6 +15,7 @@ from pipeline.artifacts.dental.corrections import (
     CORRECTIONS,
     Corrections,
     PhotoCorrection,
+    composed,
     corrections_file,
     read_corrections,
 )
@@ -107,11 +108,15 @@ def content(
     """
     by_name, as_read = teeth.by_name(), read.by_name() if read else {}
     earlier = corrections.photographs
+    labels = {composed(label): label for label in earlier}
     photographs = []
     for view in views.views:
         seen = by_name.get(view.name) or Dentition(view.name, (view.width, view.height), "none")
         names = (view.source_name, view.source_name.rpartition(".")[0], view.name)
-        label = next((name for name in names if name in earlier), view.source_name or view.name)
+        label = next(
+            (labels[name] for name in map(composed, names) if name in labels),
+            view.source_name or view.name,
+        )
         if seen.kind == UNREAD and label not in earlier:
             continue  # there is nothing to check
         said = earlier.get(label, PhotoCorrection())
