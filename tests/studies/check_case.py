@@ -70,13 +70,17 @@ def doubtful_case(
 NOWHERE = (4.0, 8.0)
 
 
-def corrected_case(folder: Path, read: Teeth, said: Mapping[str, PhotoCorrection]) -> Path:
-    """A workspace of a run with this in its `teeth.yaml`; what is `NOWHERE` was said after it."""
+def corrected_case(
+    folder: Path, read: Teeth, said: Mapping[str, PhotoCorrection], applied: bool = True
+) -> Path:
+    """A workspace of a run with this in its `teeth.yaml`; what is `NOWHERE` was said after it, or
+    all of it."""
     there = {
         name: replace(photo, crowns=tuple(c for c in photo.crowns if c.at != NOWHERE))
         for name, photo in said.items()
     }
-    workspace = doubtful_case(folder, apply_corrections(read, case.views(), Corrections(there)))
+    teeth = apply_corrections(read, case.views(), Corrections(there)) if applied else read
+    workspace = doubtful_case(folder, teeth)
     request = json.loads((workspace / "request.json").read_text())
     request["stages"] = ["views", "teeth", "init"]
     (workspace / "request.json").write_text(json.dumps(request))

@@ -175,3 +175,19 @@ def test_the_number_of_joined_parts_is_of_all_of_them(tmp_path: Path) -> None:
     assert result["start"] == [row.format(28), "28 28"]
     assert result["anew"] == [row.format(27), "27 27"]
     assert result["back"] == [row.format("?"), ""]
+
+
+@needs_chromium
+def test_numbers_that_a_refused_run_has_not_given_are_shown_and_taken_back(tmp_path: Path) -> None:
+    crowns = (CrownCorrection(case.original(2, "upper"), tooth=18),)
+    told = {"0_right.jpg": PhotoCorrection(crowns=crowns)}
+    workspace = corrected_case(tmp_path / "case", case.teeth(), told, applied=False)
+    script = """
+      result.start = row(0).join(" ");
+      chip(0, "18").click();
+      press("t");
+      result.end = [row(0).join(" "), check.yaml().includes("tooth")];
+    """
+    result = probed(workspace, tmp_path / "browser", script)
+    row = "13 12 {} 21 22 23 43 42 41 31 32 33"
+    assert result == {"start": row.format(18), "end": [row.format(11), False]}

@@ -21,6 +21,7 @@ const photos = data.photographs.map((photo) => ({
   ...photo, crowns: photo.crowns.map(withId), removed: photo.removed.map(withId), entries: photo.earlier.crowns,
   use: photo.earlier.use, kindSaid: photo.earlier.kind, mirroredSaid: photo.earlier.mirrored,
 }));
+photos.forEach((photo) => { photo.crowns = photo.crowns.map((crown) => asSaid(photo, crown)); });
 const changing = ["crowns", "removed", "entries", "use", "kindSaid", "kind", "mirrored",
   "mirroredSaid", "roll"];
 const past = [];

@@ -180,6 +180,11 @@ const splitSaid = (photo, crown) => photo.entries.findLast((entry) => entry.spli
 const numbersWithin = (photo, crown) => photo.entries
   .slice(photo.entries.indexOf(splitSaid(photo, crown)) + 1)
   .filter((entry) => entry.tooth && contains(crown.outline, shownAt(photo, entry.at)));
+// A crown with the number that was said of it: a run that was refused has not given it.
+const asSaid = (photo, crown) => {
+  const [number, ...others] = new Set(numbersWithin(photo, crown).map(({ tooth }) => tooth));
+  return !number || others.length ? crown : { ...crown, number, doubt: 0, jaw: jawOf(number) };
+};
 // Numbers and splits of what isn't read any more: they keep a run from going on.
 const lostEntries = (photo) => photo.entries.filter((entry) => (entry.tooth || entry.split)
   && !entry.was.length && !photo.crowns.some((crown) => isNear(crown, shownAt(photo, entry.at))));
