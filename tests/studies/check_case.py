@@ -87,7 +87,8 @@ def corrected_case(
     write_result(workspace, "teeth", [read])
     lines = ["photographs:"]
     for name, photo in said.items():
-        lines += [f'  "{name}":', *["    mirrored: true"] * bool(photo.mirrored), "    crowns:"]
+        lines += [f'  "{name}":', *["    mirrored: true"] * bool(photo.mirrored)]
+        lines += [*["    use: false"] * (photo.use is False), "    crowns:"]
         for change in photo.crowns:
             what = f"tooth: {change.tooth}" if change.tooth else "remove: true"
             if change.split:

@@ -191,3 +191,21 @@ def test_numbers_that_a_refused_run_has_not_given_are_shown_and_taken_back(tmp_p
     result = probed(workspace, tmp_path / "browser", script)
     row = "13 12 {} 21 22 23 43 42 41 31 32 33"
     assert result == {"start": row.format(18), "end": [row.format(11), False]}
+
+
+@needs_chromium
+def test_a_photograph_that_was_left_out_is_used_as_if_nothing_had_been_said(tmp_path: Path) -> None:
+    told = {"0_right.jpg": PhotoCorrection(use=False)}
+    workspace = corrected_case(tmp_path / "case", case.teeth(), told)
+    script = """
+      const uses = () => check.yaml().split("\\n").filter((line) => line.includes("use:")).join();
+      const shown = () => all("article h2").map((title) => title.textContent).join();
+      result.start = [shown(), uses(), all("#aside figcaption")[0].textContent];
+      all("#aside button")[0].click();
+      result.end = [shown(), uses()];
+    """
+    result = probed(workspace, tmp_path / "browser", script)
+    assert result["start"] == [
+        "1_front.jpg,2_<left>.jpg", "    use: false", "0_right.jpgleft out by you",
+    ]  # fmt: skip
+    assert result["end"] == ["0_right.jpg,1_front.jpg,2_<left>.jpg", ""]

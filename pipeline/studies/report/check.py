@@ -133,7 +133,7 @@ def content(
 def _photograph(
     view: View, seen: Dentition, read: Dentition, label: str, earlier: PhotoCorrection
 ) -> Content:
-    from stages.dentition.corrections import crowns_before
+    from stages.dentition.corrections import LEFT_OUT, crowns_before
 
     before = [
         [_crown(crown) for crown in crowns]
@@ -143,6 +143,8 @@ def _photograph(
         {"at": list(change.at)} | (was[0] if was else _NO_CROWN)
         for change, was in zip(earlier.crowns, before, strict=True) if change.remove
     ]  # fmt: skip
+    # What a person has left out is taken back to what was read.
+    aside = read.set_aside if seen.set_aside == LEFT_OUT else seen.set_aside
     gone = [crown["outline"] for crown in removed]
     crowns = [_crown(crown) for crown in seen.all_crowns if len(crown.outline) >= 3]
     shown = picture(
@@ -160,7 +162,7 @@ def _photograph(
         "mirrored": bool(seen.mirrored),
         "roll": round(float(seen.roll), 4),
         "kind": seen.kind,
-        "aside": seen.set_aside or ("" if seen.all_crowns else _NOTHING[seen.kind == UNREAD]),
+        "aside": aside or ("" if seen.all_crowns else _NOTHING[seen.kind == UNREAD]),
         "crowns": [crown for crown in crowns if crown["outline"] not in gone],
         "removed": removed,
         "earlier": _entries(earlier, before),

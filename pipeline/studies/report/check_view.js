@@ -80,7 +80,7 @@ const cardOf = (photo) => {
 };
 const useIt = (photo, use) => {
   change(() => {
-    photo.use = use === !photo.aside && photo.earlier.use === null ? null : use;
+    photo.use = use === !photo.aside && photo.earlier.use !== true ? null : use;
     if (chosen?.photo === photo) chosen = null;
   });
   say(`${photo.name} is ${use ? "used" : "left out"}.`);
