@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, is_primary, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition
+from pipeline.errors import RequestError
 from stages.dentition.tooth_rows import believed, number_is_said
 
 #: Places from the midline at which a jaw's primary teeth are left, as they go: incisors first; then
@@ -70,6 +71,29 @@ def said_numbers(dentitions: Iterable[Dentition]) -> dict[int, bool]:
         for crown in dentition.all_crowns
         if number_is_said(crown) and crown.number % 10 <= PRIMARY_PLACES
     }
+
+
+def refuse_two_in_one_place(dentitions: Iterable[Dentition], names: Iterable[str]) -> None:
+    """Refuse that a primary tooth and its successor are said to stand in one place.
+
+    Args:
+        dentitions: those of one mouth.
+        names: of their photographs.
+
+    Raises:
+        RequestError: with both and their photographs.
+    """
+    said: dict[int, tuple[int, str]] = {}
+    for dentition, name in zip(dentitions, names, strict=True):
+        for number in (crown.number for crown in dentition.all_crowns if number_is_said(crown)):
+            other, there = said.setdefault(permanent_of(number), (number, name))
+            if other != number:
+                raise RequestError(
+                    f"The tooth numbers given contradict each other: {other} in {there}, {number} "
+                    f"in {name}. A primary tooth and the one that follows it have one place in the "
+                    "row: say the same of it everywhere; where both stand, give one its number and "
+                    "remove the other."
+                )
 
 
 def looks_cost(looks: Mapping[int, float], primary: frozenset[int]) -> float:

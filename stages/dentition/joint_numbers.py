@@ -20,7 +20,13 @@ from pipeline.artifacts.cameras import Camera
 from pipeline.artifacts.dental.fdi import JAWS, PRIMARY_PLACES, WISDOM, Jaw, primary_of, teeth_of
 from pipeline.artifacts.teeth import Crown, Dentition, Teeth
 from pipeline.artifacts.views import View
-from stages.dentition.changing_teeth import molars_cost, odds_of_left, primary_odds, said_numbers
+from stages.dentition.changing_teeth import (
+    molars_cost,
+    odds_of_left,
+    primary_odds,
+    refuse_two_in_one_place,
+    said_numbers,
+)
 from stages.dentition.same_tooth import Overlaps, crown_overlaps, looking_alike, same_teeth
 from stages.dentition.spacing import Row, spacing_cost, spacing_evidence, unit_of
 from stages.dentition.tooth_rows import (
@@ -86,9 +92,14 @@ def agreed_numbers(
         teeth: as each photograph was read by itself.
         views: the placed photographs.
         cameras, depths: of each, with z-depth [H, W], 0 where unknown.
+
+    Raises:
+        RequestError: a primary tooth and its successor are said to stand in one place.
     """
     read = {dentition.name: dentition for dentition in teeth.chosen}
     dentitions = [read.get(view.name) for view in views]
+    shown = {v.source_name or v.name: read[v.name] for v in views if v.name in read}
+    refuse_two_in_one_place(shown.values(), shown)
     if sum(dentition is not None for dentition in dentitions) < 2:
         return teeth
     overlaps = crown_overlaps(views, dentitions, cameras, depths)

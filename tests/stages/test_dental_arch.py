@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artifacts.dental.fdi import JAWS, Jaw, other_side
+from pipeline.artifacts.dental.fdi import JAWS, Jaw
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
 from stages.dentition.tooth_rows import POSITIONS
@@ -365,16 +365,6 @@ def test_numbers_that_contradict_are_refused() -> None:
     for index, tooth in ((2, teeth[1][0][4]), (3, teeth[1][0][2])):
         dentitions[1] = with_crown(dentitions[1], index, number=tooth, doubt=0.0)
     with pytest.raises(RequestError, match="given for photo 1 contradict"):
-        fit(dentitions, SHORT)
-
-
-def test_numbers_of_the_other_side_are_called_so() -> None:
-    """Who looks into a mirror, or at a person, takes the left of the picture for the left."""
-    dentitions, _, teeth = three()
-    for index in (1, 2, 5):
-        said = other_side(teeth[1][0][index])
-        dentitions[1] = with_crown(dentitions[1], index, number=said, doubt=0.0)
-    with pytest.raises(RequestError, match="given for photo 1 run from left to right the wrong"):
         fit(dentitions, SHORT)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.artifacts.dental.fdi import primary_of, teeth_of
 from pipeline.artifacts.teeth import Dentition, Teeth
+from pipeline.errors import RequestError
 from stages.dentition.joint_numbers import agreed_numbers
 from tests.stages import arch_wall_case as wall
 
@@ -87,6 +88,16 @@ def test_what_a_person_said_of_one_photograph_counts_for_all() -> None:
     truth = [number for number in wall.truth_of(cameras[1]) if number != 15]
     assert numbers_of(found[1]) == [15 if number == 14 else number for number in truth]
     assert [c.doubt for c in found[0].upper if c.number == 15] == [0.0]
+
+
+def test_a_primary_tooth_and_its_successor_are_not_both_said_of_one_place() -> None:
+    cameras, views, read = wall.case()
+    for k, number in ((0, 14), (1, 54)):
+        upper = (replace(c, doubt=0.0, number=number) if c.number == 14 else c
+                 for c in read[k].upper)  # fmt: skip
+        read[k] = replace(read[k], upper=tuple(upper))
+    with pytest.raises(RequestError, match=r"14 in .*, 54 in .*\. A primary tooth and the one"):
+        agreed(cameras, views, read)
 
 
 def test_a_wisdom_tooth_that_a_person_said_is_one_in_all_photographs() -> None:

@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts.dental.fdi import JAWS
+from pipeline.artifacts.dental.fdi import JAWS, permanent_of, teeth_of
 from pipeline.artifacts.teeth import Dentition
 from pipeline.errors import RequestError
+from stages.dentition.changing_teeth import refuse_two_in_one_place
 from stages.dentition.tooth_rows import NO_TOOTH, Labels
 from stages.init.dental.cameras.held import held_cameras, roll_matrix
 from stages.init.dental.landmarks import Landmark
@@ -53,10 +54,9 @@ from stages.init.dental.numbering.matching import Matching
 from stages.init.dental.numbering.mirrored import MIRRORED, mirror_evidence
 from stages.init.dental.numbering.primary import ALL_PRIMARY, perhaps_primary, primary_teeth
 from stages.init.dental.numbering.rivals import judged_by_pictures, label_doubts, margins
-from stages.init.dental.numbering.said import contradiction, said_labels
 from stages.init.dental.numbering.sightings import as_a_childs, seen_rows
 from stages.init.dental.solution import ArchFit, PlacedView
-from stages.init.dental.template import landmark_names, textbook_arch, tooth_at
+from stages.init.dental.template import landmark_names, position_of, textbook_arch, tooth_at
 
 __all__ = ["ArchOptions", "fit_arch"]
 
@@ -134,7 +134,8 @@ def fit_arch(
         order=None if options.order is None else tuple(options.order[i] for i in placeable),
     )
     shown = [names[i] for i in placeable]
-    fixed = said_labels(read, shown)
+    refuse_two_in_one_place(read, shown)
+    fixed = _fixed_labels(read)
     focal, deviation = _focal_priors([focals[i] for i in placeable], read, options)
     rows = [seen_rows(dentition) for dentition in read]
 
@@ -215,6 +216,17 @@ def _check(
             )
 
 
+def _fixed_labels(dentitions: list[Dentition]) -> Fixed:
+    """Crowns whose number a person has said (doubt 0) -> position."""
+    return {
+        (view, jaw, crown): position_of(permanent_of(found.number))
+        for view, dentition in enumerate(dentitions)
+        for jaw, name in enumerate(JAWS)
+        for crown, found in enumerate(dentition.crowns(name))
+        if not found.doubt and permanent_of(found.number) in teeth_of(name)
+    }
+
+
 def _focal_priors(
     focals: list[float | None], dentitions: list[Dentition], options: ArchOptions
 ) -> tuple[Array, Array]:
@@ -238,7 +250,12 @@ def _label(
         roles = roles_of_view(view, count, scorer.options)
         candidates[view] = view_candidates(scorer, view, roles, fixed)
         if not candidates[view]:
-            raise RequestError(contradiction(photos[view], view, fixed))
+            raise RequestError(
+                f"The tooth numbers given for {photos[view]} contradict each other, or the teeth "
+                "beside and opposite them: from left to right each crown is the next tooth of its "
+                "row, and the same teeth of both jaws stand above each other; only two crowns that "
+                "touch may have one number, as parts of one."
+            )
     progress("numbering the teeth", 0, 1)
     found = search(scorer, candidates)
     starts: list[Scored] = []
