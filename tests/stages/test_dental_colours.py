@@ -34,7 +34,15 @@ def photograph(
     light[mask] = enamel
     light = np.clip(light * gains, 0, 1) * np.random.default_rng(0).uniform(0.97, 1.03, light.shape)
     image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return image.astype(np.float32), SimpleNamespace(mask=mask, band_height=60.0)
+    return image.astype(np.float32), crowns(mask)
+
+
+def crowns(mask: np.ndarray, on_jaws: np.ndarray | None = None) -> SimpleNamespace:
+    """A dentition of this mask; without `on_jaws` all around it is gum."""
+    everywhere = np.ones(mask.shape, bool)
+    return SimpleNamespace(
+        mask=mask, band_height=60.0, on_jaws_mask=everywhere if on_jaws is None else on_jaws
+    )
 
 
 def distances(*photographs: tuple[np.ndarray, SimpleNamespace]) -> list[ColourDistance]:
@@ -71,9 +79,23 @@ def test_brackets_are_not_the_colour_of_enamel() -> None:
     assert other[2].one_light > 3, "another patient's gum is another's beside braces, too"
 
 
+def test_a_lip_and_the_dark_behind_an_open_bite_are_no_gum() -> None:
+    image, dentition = photograph()
+    on_jaws = np.ones(dentition.mask.shape, bool)
+    on_jaws[:42] = on_jaws[76:110] = False
+    covered = np.where((on_jaws | dentition.mask)[..., None], image, np.float32(0.02))
+    told = distances(photograph(), (covered, crowns(dentition.mask, on_jaws)))
+    assert max(max(d.one_light, d.any_light) for d in told) < 0.5
+    assert min(d.one_light for d in distances(photograph(), (covered, dentition))) > 3
+    # where all is taken for lip, it is better than nothing
+    nowhere = crowns(dentition.mask, np.zeros_like(on_jaws))
+    other = distances(photograph(), (photograph(gum=(0.30, 0.20, 0.22))[0], nowhere))
+    assert min(d.one_light for d in other) > 3
+
+
 def test_a_photograph_without_gum_says_nothing() -> None:
     image, dentition = photograph()
-    everything = SimpleNamespace(mask=np.ones((120, 200), bool), band_height=60.0)
+    everything = crowns(np.ones((120, 200), bool))
     found = distances((image, dentition), (image, everything))
     assert [(d.one_light, d.any_light) for d in found] == [(0.0, 0.0)] * 2
 

@@ -43,6 +43,8 @@ GUM_NEAR, GUM_FAR = 0.03, 0.12
 #: From the upper to the lower gum line, mm: median of eight patients with permanent teeth (12 to
 #: 17; of four children 9 to 10). It says how wide metal is that is looked for.
 BAND = 14.0
+#: Of fewer pixels nothing is said.
+LEAST_PIXELS = 50
 #: Light that counts as none, of 0..1.
 DARK = 1e-4
 
@@ -97,7 +99,11 @@ def tissue_colours(image: Image, dentition: Dentition, metal: Mask | None) -> Ti
         enamel &= ~metal
     away = cv2.distanceTransform(1 - teeth, cv2.DIST_L2, 5) / max(dentition.band_height, 1.0)
     gum = (away > GUM_NEAR) & (away < GUM_FAR)
-    if min(enamel.sum(), gum.sum()) < 50:
+    # lips lie there too, and the dark of an open bite
+    sure = gum & dentition.on_jaws_mask
+    if sure.sum() >= LEAST_PIXELS:
+        gum = sure
+    if min(enamel.sum(), gum.sum()) < LEAST_PIXELS:
         return None
     logs = [np.log(np.maximum(linear(np.median(rgb[where], axis=0)), DARK))
             for where in (enamel, gum)]  # fmt: skip
