@@ -93,9 +93,10 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
         return ""
     names = list(allowed)
     suffix = PurePath(name.casefold()).suffix
+    shared = any(each.casefold().endswith(suffix) for each in names)
 
     def plain(each: str) -> str:
-        return each.casefold().removesuffix(suffix)
+        return each.casefold().removesuffix(suffix if shared else "")
 
     close = difflib.get_close_matches(plain(name), map(plain, names), n=1, cutoff=0.5)
     fitting = [each for each in names if plain(each) in close]
