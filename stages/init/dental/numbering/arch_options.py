@@ -98,7 +98,7 @@ class ArchOptions:
     any_light_colour_weight: float = 2.0
     any_light_match_weight: float = 3.0
     usual_share: float = 0.008
-    any_light_cost: float = 2.0
+    any_light_cost: float = 1.25
     #: Were all photographs taken at one sitting, by the camera's clock? None: it doesn't say. What
     #: that adds to the evidence for one mouth, or takes from it: a factor of 20 to the odds. It is
     #: an assumption: of photographs that were mixed up, one set in twenty was taken within the
